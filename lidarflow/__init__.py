@@ -1,0 +1,3 @@
+"""lidarflow: a rigid motion for every LiDAR point between consecutive scans."""
+
+__version__ = "0.1.0"

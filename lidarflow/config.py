@@ -1,0 +1,237 @@
+"""Every algorithm setting, frozen, with its unit and effect.
+
+Order of precedence: the defaults here, then a TOML file, then `section.name=value` overrides. An unknown
+key is an error that names the nearest known one. Viewer options and paths are not settings.
+"""
+
+import difflib
+import sys
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from lidarflow.errors import ConfigError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+def setting(default: Any, effect: str, *, low: float | None = None, high: float | None = None,
+            choices: tuple[str, ...] | None = None) -> Any:
+    """A dataclass field with its effect in words and the values it may take."""
+    return field(default=default, metadata={"effect": effect, "low": low, "high": high, "choices": choices})
+
+
+@dataclass(frozen=True, slots=True)
+class PreparationConfig:
+    kitti_correction: str = setting(
+        "auto", "raise KITTI points by the 0.205 deg that their calibration lacks; auto = for KITTI data",
+        choices=("auto", "on", "off"))
+    min_range_m: float = setting(2.0, "nearer returns are the ego vehicle and are masked", low=0)
+    max_range_m: float = setting(80.0, "farther returns are masked", low=1)
+
+
+@dataclass(frozen=True, slots=True)
+class GroundConfig:
+    sensor_height_m: float = setting(0.0, "height of the sensor over ground; 0 = estimated per scan", low=0)
+    max_height_m: float = setting(
+        0.25, "points higher than this over the ground surface around them are not ground", low=0.02)
+
+
+@dataclass(frozen=True, slots=True)
+class NormalsConfig:
+    neighbours: int = setting(12, "points a normal is fitted to, at most", low=4, high=100)
+    radius_m: float = setting(0.6, "how far those points may be", low=0.01)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshConfig:
+    method: str = setting("auto", "scan grid for spinning sensors, tangent planes for other clouds",
+                          choices=("auto", "grid", "tangent"))
+    max_edge_m: float = setting(0.38, "longest edge where the scan is dense", low=0.01)
+    max_edge_deg: float = setting(
+        0.9, "longest edge, seen from the sensor, where rings are farther apart than max_edge_m", low=0)
+    max_depth_jump_m: float = setting(0.36, "largest change of range along an edge", low=0.01)
+    min_grazing_deg: float = setting(
+        4.0, "an edge closer than this to the line of sight is a jump between surfaces", low=0, high=60)
+
+
+@dataclass(frozen=True, slots=True)
+class ShotConfig:
+    radius_m: float = setting(1.2, "radius of the neighbourhood that a descriptor sees", low=0.05)
+    surface_voxel_m: float = setting(0.1, "the surface is thinned to one point per voxel; 0 = all", low=0)
+    min_neighbours: int = setting(10, "points with fewer neighbours get no descriptor", low=5)
+
+
+@dataclass(frozen=True, slots=True)
+class MatchingConfig:
+    keypoint_voxel_m: float = setting(0.3, "one keypoint per voxel", low=0.02)
+    max_speed_m_per_s: float = setting(
+        25.0, "largest plausible speed relative to the start value; sets the gate", low=0.1)
+    mutual_radius_m: float = setting(
+        0.35, "a match is mutual when matching back ends this close to where it began", low=0)
+    max_ratio: float = setting(
+        0.9, "best over second best descriptor distance, the second elsewhere", low=0.1, high=1)
+    rival_radius_m: float = setting(0.6, "rivals of the best match are farther from it than this", low=0)
+
+
+@dataclass(frozen=True, slots=True)
+class GraphConfig:
+    start: str = setting("previous", "start value: the previous pair's motions, or only the ego-motion",
+                         choices=("previous", "ego"))
+    thinning_m: float = setting(0.0, "one variable per voxel and component instead of one per point; "
+                                "0 = every point", low=0)
+    min_matches: int = setting(3, "components with fewer matches keep their start value", low=1)
+
+
+@dataclass(frozen=True, slots=True)
+class SolverConfig:
+    truncation_m: float = setting(
+        0.05**0.5, "c: residuals beyond it count as outliers (c² = 0.05 m²)", low=1e-3)
+    smoothness_frame: str = setting(
+        "point", "twist between neighbours seen at the point or at the sensor (the paper's)",
+        choices=("point", "sensor"))
+    data_weight: float = setting(1.0, "weight of a squared match residual in m²", low=0)
+    smoothness_weight: float = setting(1.0, "weight of a squared twist between neighbours", low=0)
+    max_iterations: int = setting(50, "Levenberg-Marquardt iterations per step and component", low=1)
+    relative_tolerance: float = setting(1e-4, "stop when an iteration gains less than this share", low=0)
+
+
+@dataclass(frozen=True, slots=True)
+class EgoConfig:
+    method: str = setting(
+        "auto", "auto = KISS-ICP in a sequence, two-scan registration for a pair",
+        choices=("auto", "registration", "kiss_icp"))
+    refine: bool = setting(True, "register the two scans once more, from the KISS-ICP motion")
+    voxel_m: float = setting(0.3, "clouds are thinned to this before registration", low=0.02)
+
+
+@dataclass(frozen=True, slots=True)
+class DynamicConfig:
+    min_speed_m_per_s: float = setting(0.5, "slower residual motion counts as static", low=0)
+    smoothing_rounds: int = setting(10, "how often residual motion is averaged over the mesh", low=0)
+    explained_m: float = setting(
+        0.1, "a point this close to the next scan after ego-motion alone is static", low=0)
+
+
+@dataclass(frozen=True, slots=True)
+class CrispnessConfig:
+    sigma_m: float = setting(0.2, "σ of eq. 15: how far off still counts as aligned", low=1e-3)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """All settings of the LiDAR pipeline."""
+
+    preparation: PreparationConfig = field(default_factory=PreparationConfig)
+    ground: GroundConfig = field(default_factory=GroundConfig)
+    normals: NormalsConfig = field(default_factory=NormalsConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    shot: ShotConfig = field(default_factory=ShotConfig)
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    ego: EgoConfig = field(default_factory=EgoConfig)
+    dynamic: DynamicConfig = field(default_factory=DynamicConfig)
+    crispness: CrispnessConfig = field(default_factory=CrispnessConfig)
+
+
+def load(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Config:
+    """Defaults, then a TOML file, then overrides such as "mesh.max_edge_m=0.5".
+
+    Raises ConfigError for a file that cannot be read, an unknown key, or a value out of range.
+    """
+    config = Config()
+    if file is not None:
+        config = updated(config, _read_toml(Path(file)), str(file))
+    for override in overrides:
+        config = updated(config, _parse_override(override), "--set")
+    return config
+
+
+def updated(config: Config, changes: dict, origin: str = "settings") -> Config:
+    """A copy of `config` with nested `changes` {section: {name: value}}, each of them checked."""
+    sections = {f.name for f in fields(config)}
+    for section, values in changes.items():
+        if section not in sections:
+            raise ConfigError(f"{origin}: unknown section '{section}'{_nearest(section, sections)}")
+        if not isinstance(values, dict):
+            raise ConfigError(f"{origin}: '{section}' is a section, write it as [{section}]")
+        current = getattr(config, section)
+        checked = {name: _check(current, section, name, value, origin) for name, value in values.items()}
+        config = replace(config, **{section: replace(current, **checked)})
+    return config
+
+
+def to_dict(config: Config) -> dict:
+    """Nested plain values, ready for TOML or JSON."""
+    return asdict(config)
+
+
+def describe() -> list[tuple[str, str, str, str]]:
+    """Rows (key, default, allowed, effect) for every setting."""
+    rows = []
+    for section in fields(Config):
+        defaults = section.default_factory()
+        for f in fields(defaults):
+            meta = f.metadata
+            allowed = " | ".join(meta["choices"]) if meta["choices"] else _range_text(meta)
+            rows.append((f"{section.name}.{f.name}", str(f.default), allowed, meta["effect"]))
+    return rows
+
+
+def _range_text(meta: dict) -> str:
+    low, high = meta["low"], meta["high"]
+    if low is None:
+        return ""
+    return f"≥ {low:g}" if high is None else f"{low:g} .. {high:g}"
+
+
+def _read_toml(file: Path) -> dict:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{file}: no such settings file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{file}: not valid TOML ({error})") from None
+
+
+def _parse_override(override: str) -> dict:
+    key, equals, text = override.partition("=")
+    section, dot, name = key.strip().partition(".")
+    if not equals or not dot:
+        raise ConfigError(f"--set {override}: expected section.name=value, e.g. mesh.max_edge_m=0.5")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()
+    return {section: {name: value}}
+
+
+def _check(section_config: Any, section: str, name: str, value: Any, origin: str) -> Any:
+    """`value` converted to the setting's type, or a ConfigError that says what was expected."""
+    known = {f.name: f for f in fields(section_config)}
+    if name not in known:
+        raise ConfigError(f"{origin}: unknown setting '{section}.{name}'{_nearest(name, known)}")
+    kind, meta = get_type_hints(type(section_config))[name], known[name].metadata
+    key = f"{origin}: {section}.{name}"
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise ConfigError(f"{key}: expected {kind.__name__}, got {value!r}")
+    if meta["choices"] and value not in meta["choices"]:
+        raise ConfigError(f"{key}: expected one of {', '.join(meta['choices'])}, got {value!r}")
+    if kind in (int, float):
+        low, high = meta["low"], meta["high"]
+        if value != value or (low is not None and value < low) or (high is not None and value > high):
+            raise ConfigError(f"{key}: expected {_range_text(meta)}, got {value!r}")
+    return value
+
+
+def _nearest(name: str, known) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" - did you mean '{close[0]}'?" if close else f"; known are {', '.join(sorted(known))}"

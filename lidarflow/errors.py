@@ -1,0 +1,21 @@
+"""Errors a user can act on: what was found, what was expected, what to do."""
+
+
+class LidarflowError(Exception):
+    """Any problem with data or settings; the command line shows it as one line and exits with 1."""
+
+
+class ConfigError(LidarflowError):
+    """A setting is unknown, of the wrong type, or out of its range."""
+
+
+class DataError(LidarflowError):
+    """A file or a scan cannot be used as it is."""
+
+
+class SolveError(LidarflowError):
+    """The optimiser could not produce an answer for a well-formed problem."""
+
+
+class InstallError(LidarflowError):
+    """A package or a system library that lidarflow needs is missing."""

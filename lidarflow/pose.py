@@ -1,0 +1,134 @@
+"""Rigid motions as (..., 4, 4) arrays; the only home of rotation and quaternion arithmetic.
+
+`a_from_b` maps coordinates in frame b to coordinates in frame a. A twist is (rotation, translation) in
+radians and metres, as in gtsam. A quaternion is x, y, z, w.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+_SMALL_ANGLE = 1e-4
+
+
+def identity(*shape: int) -> np.ndarray:
+    """Identity motions (*shape, 4, 4)."""
+    return np.tile(np.eye(4), (*shape, 1, 1))
+
+
+def from_rotation_translation(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Motions (..., 4, 4) from rotation matrices (..., 3, 3) and translations (..., 3) in metres."""
+    rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    motion = identity(*shape)
+    motion[..., :3, :3] = rotation
+    motion[..., :3, 3] = translation
+    return motion
+
+
+def from_translation(translation: np.ndarray) -> np.ndarray:
+    """Pure translations (..., 4, 4) from vectors (..., 3) in metres."""
+    return from_rotation_translation(np.eye(3), translation)
+
+
+def from_yaw(yaw: float, translation: np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """Motion (4, 4) that turns about z by `yaw` radians, then moves by `translation` metres."""
+    return from_rotation_translation(Rotation.from_euler("z", yaw).as_matrix(), translation)
+
+
+def inverse(motion: np.ndarray) -> np.ndarray:
+    """Inverse motions (..., 4, 4)."""
+    rotation = np.swapaxes(motion[..., :3, :3], -1, -2)
+    return from_rotation_translation(rotation, -(rotation @ motion[..., :3, 3:])[..., 0])
+
+
+def apply(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (..., 3) in metres moved by motions (..., 4, 4); the leading shapes broadcast."""
+    if motion.ndim == 2:
+        return points @ motion[:3, :3].T + motion[:3, 3]
+    return np.einsum("...ij,...j->...i", motion[..., :3, :3], points) + motion[..., :3, 3]
+
+
+def hat(vector: np.ndarray) -> np.ndarray:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    vector = np.asarray(vector, float)
+    matrix = np.zeros((*vector.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -vector[..., 2], vector[..., 1], -vector[..., 0]
+    return matrix - np.swapaxes(matrix, -1, -2)
+
+
+def _left_jacobian(rotation_vector: np.ndarray) -> np.ndarray:
+    """Left Jacobian of SO(3), (..., 3, 3): it turns a twist's translation into a motion's."""
+    angle = np.linalg.norm(rotation_vector, axis=-1)[..., None, None]
+    small = angle < _SMALL_ANGLE
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    cross = hat(rotation_vector)
+    return np.eye(3) + a * cross + b * (cross @ cross)
+
+
+def exp(twist: np.ndarray) -> np.ndarray:
+    """Motions (..., 4, 4) of twists (..., 6), rotation first."""
+    twist = np.asarray(twist, float)
+    rotation_vector, translation = twist[..., :3], twist[..., 3:]
+    rotation = Rotation.from_rotvec(rotation_vector.reshape(-1, 3)).as_matrix()
+    moved = (_left_jacobian(rotation_vector) @ translation[..., None])[..., 0]
+    return from_rotation_translation(rotation.reshape(*twist.shape[:-1], 3, 3), moved)
+
+
+def log(motion: np.ndarray) -> np.ndarray:
+    """Twists (..., 6), rotation first, of motions (..., 4, 4)."""
+    motion = np.asarray(motion, float)
+    rotation_vector = Rotation.from_matrix(motion[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
+    rotation_vector = rotation_vector.reshape(*motion.shape[:-2], 3)
+    translation = np.linalg.solve(_left_jacobian(rotation_vector), motion[..., :3, 3:])[..., 0]
+    return np.concatenate([rotation_vector, translation], axis=-1)
+
+
+def adjoint(motion: np.ndarray) -> np.ndarray:
+    """Adjoint matrices (..., 6, 6): Log(T exp(ξ) T⁻¹) = Ad(T) ξ, rotation first."""
+    rotation = motion[..., :3, :3]
+    matrix = np.zeros((*motion.shape[:-2], 6, 6))
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = rotation
+    matrix[..., 3:, :3] = hat(motion[..., :3, 3]) @ rotation
+    return matrix
+
+
+def interpolate(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
+    """Motion at `share` of the screw path from `start` (0) to `end` (1), shapes (..., 4, 4)."""
+    return start @ exp(share * log(inverse(start) @ end))
+
+
+def translation_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance in metres (...) between the origins of motions (..., 4, 4)."""
+    return np.linalg.norm((inverse(a) @ b)[..., :3, 3], axis=-1)
+
+
+def rotation_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle in radians (...) between the rotations of motions (..., 4, 4)."""
+    relative = np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]
+    return Rotation.from_matrix(relative.reshape(-1, 3, 3)).magnitude().reshape(relative.shape[:-2])
+
+
+def to_translation_quaternion(motion: np.ndarray) -> np.ndarray:
+    """Rows (..., 7) tx ty tz qx qy qz qw of motions (..., 4, 4), with qw ≥ 0."""
+    rotation = Rotation.from_matrix(motion[..., :3, :3].reshape(-1, 3, 3))
+    quaternion = rotation.as_quat(canonical=True).reshape(*motion.shape[:-2], 4)
+    return np.concatenate([motion[..., :3, 3], quaternion], axis=-1)
+
+
+def from_translation_quaternion(rows: np.ndarray) -> np.ndarray:
+    """Motions (..., 4, 4) of rows (..., 7) tx ty tz qx qy qz qw."""
+    rows = np.asarray(rows, float)
+    rotation = Rotation.from_quat(rows[..., 3:].reshape(-1, 4)).as_matrix()
+    return from_rotation_translation(rotation.reshape(*rows.shape[:-1], 3, 3), rows[..., :3])
+
+
+def is_rigid(motion: np.ndarray, tolerance: float = 1e-6) -> bool:
+    """Whether every motion (..., 4, 4) is finite, orthonormal and right-handed, with a last row 0 0 0 1."""
+    if motion.shape[-2:] != (4, 4) or not np.isfinite(motion).all():
+        return False
+    rotation = motion[..., :3, :3]
+    orthonormal = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=tolerance)
+    right_handed = bool((np.linalg.det(rotation) > 0).all())
+    return orthonormal and right_handed and np.allclose(motion[..., 3, :], [0, 0, 0, 1], atol=tolerance)

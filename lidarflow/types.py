@@ -1,0 +1,197 @@
+"""The data that flows through the pipeline: frozen, and checked at the door.
+
+Arrays keep the length and order of the input cloud; masks say what is valid. Lengths are metres, angles
+radians, times integer nanoseconds.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarflow import pose
+
+
+def _check(name: str, array: np.ndarray, shape: tuple, kind: str) -> None:
+    """Raise ValueError unless `array` has `shape` (None = any length) and dtype kind in `kind`."""
+    if not isinstance(array, np.ndarray):
+        raise ValueError(f"{name}: expected a numpy array, got {type(array).__name__}")
+    wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ")"
+    fits = array.ndim == len(shape) and all(
+        n is None or n == m for n, m in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        raise ValueError(f"{name}: expected shape {wanted}, got {array.shape}")
+    if array.dtype.kind not in kind:
+        raise ValueError(f"{name}: expected dtype kind {kind!r}, got {array.dtype}")
+
+
+def _check_motion(name: str, motion: np.ndarray) -> None:
+    _check(name, motion, (4, 4), "f")
+    if not pose.is_rigid(motion, tolerance=1e-4):
+        raise ValueError(f"{name}: expected a rigid motion, got\n{motion}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One LiDAR sweep in its own sensor frame.
+
+    points   (N, 3) float64   metres; NaN rows are allowed and stay NaN in every result
+    time_ns  int              start of the sweep
+    name     str              what messages and files call it, e.g. "000042"
+    """
+
+    points: np.ndarray
+    time_ns: int = 0
+    name: str = "scan"
+
+    def __post_init__(self):
+        _check(f"{self.name}: points", self.points, (None, 3), "f")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPair:
+    """Two consecutive scans; the flow carries `source` onto `target`."""
+
+    source: Scan
+    target: Scan
+
+    @property
+    def dt_s(self) -> float:
+        """Seconds from source to target; 0.1 (a 10 Hz sensor) where the times do not say."""
+        dt = (self.target.time_ns - self.source.time_ns) * 1e-9
+        return dt if dt > 0 else 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What really happened between a scan and the next, rows aligned with the source scan.
+
+    flow        (N, 3) float   metres, total: p moves to p + flow in the target's sensor frame
+    ego_motion  (4, 4) float   target_from_source
+    valid       (N,) bool      rows that are known and count in scores
+    is_dynamic  (N,) bool      the point moves over ground
+    object_id   (N,) int       id of the object the point is on, -1 = background
+    """
+
+    flow: np.ndarray
+    ego_motion: np.ndarray
+    valid: np.ndarray
+    is_dynamic: np.ndarray
+    object_id: np.ndarray
+
+    def __post_init__(self):
+        _check("Truth.flow", self.flow, (None, 3), "f")
+        n = len(self.flow)
+        _check("Truth.valid", self.valid, (n,), "b")
+        _check("Truth.is_dynamic", self.is_dynamic, (n,), "b")
+        _check("Truth.object_id", self.object_id, (n,), "i")
+        _check_motion("Truth.ego_motion", self.ego_motion)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowProblem:
+    """The factor graph of one pair, free of any solver (Dewan et al. 2016, eq. 4).
+
+    points         (M, 3) float64      where the variables sit: the graph's points, metres, source frame
+    initial        (M, 4, 4) float64   start values of τ, target_from_source
+    match_index    (K,) int32          the variable a match belongs to; at most one match each
+    match_target   (K, 3) float64      the matched position p', metres, target frame
+    edges          (E, 2) int32        mesh neighbours, i < j, unique
+    component      (M,) int32          mesh component of each variable, 0 .. C-1
+    """
+
+    points: np.ndarray
+    initial: np.ndarray
+    match_index: np.ndarray
+    match_target: np.ndarray
+    edges: np.ndarray
+    component: np.ndarray
+
+    def __post_init__(self):
+        _check("FlowProblem.points", self.points, (None, 3), "f")
+        m = len(self.points)
+        _check("FlowProblem.initial", self.initial, (m, 4, 4), "f")
+        _check("FlowProblem.match_index", self.match_index, (None,), "i")
+        _check("FlowProblem.match_target", self.match_target, (len(self.match_index), 3), "f")
+        _check("FlowProblem.edges", self.edges, (None, 2), "i")
+        _check("FlowProblem.component", self.component, (m,), "i")
+        for name, index in (("match_index", self.match_index), ("edges", self.edges)):
+            if index.size and (index.min() < 0 or index.max() >= m):
+                raise ValueError(f"FlowProblem.{name}: indices must lie in 0..{m - 1}")
+        if len(self.edges) and not (self.edges[:, 0] < self.edges[:, 1]).all():
+            raise ValueError("FlowProblem.edges: expected i < j in every row")
+        if len(np.unique(self.match_index)) != len(self.match_index):
+            raise ValueError("FlowProblem.match_index: a variable has more than one match")
+
+
+@dataclass(frozen=True, slots=True)
+class SolveStats:
+    """What the optimiser did; the same for every solver.
+
+    Errors are energies: half the sum of squared (or truncated) residuals. `plain` is the step without the
+    robust kernel, `robust` the step with it. `stopped` counts components by reason of stopping.
+    """
+
+    solver: str
+    variables: int
+    matches: int
+    edges: int
+    components: int
+    solved_components: int
+    plain_iterations: int
+    robust_iterations: int
+    plain_initial_error: float
+    plain_final_error: float
+    robust_initial_error: float
+    robust_final_error: float
+    inliers: int
+    stopped: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowResult:
+    """The answer for one pair, rows aligned with the source scan.
+
+    flow         (N, 3) float64      metres, total: τ p − p, ego-motion included; NaN where p is NaN
+    motions      (N, 4, 4) float64   τ of every point, target_from_source
+    valid        (N,) bool           the motion rests on evidence, not on a start value
+    in_graph     (N,) bool           the motion was solved for, not taken from the ego-motion
+    is_dynamic   (N,) bool           moves over ground by itself
+    ego_motion   (4, 4) float64      target_from_source of the static world
+    stats        SolveStats
+    seconds      dict                wall time of each stage
+    match_source (K, 3) float64      matched points, metres, source frame
+    match_target (K, 3) float64      where their matches are, metres, target frame
+    """
+
+    flow: np.ndarray
+    motions: np.ndarray
+    valid: np.ndarray
+    in_graph: np.ndarray
+    is_dynamic: np.ndarray
+    ego_motion: np.ndarray
+    stats: SolveStats
+    seconds: dict[str, float] = field(default_factory=dict)
+    match_source: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    match_target: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+
+    def __post_init__(self):
+        _check("FlowResult.flow", self.flow, (None, 3), "f")
+        n = len(self.flow)
+        _check("FlowResult.motions", self.motions, (n, 4, 4), "f")
+        for name in ("valid", "in_graph", "is_dynamic"):
+            _check(f"FlowResult.{name}", getattr(self, name), (n,), "b")
+        _check("FlowResult.match_source", self.match_source, (None, 3), "f")
+        _check("FlowResult.match_target", self.match_target, (len(self.match_source), 3), "f")
+        _check_motion("FlowResult.ego_motion", self.ego_motion)
+
+    def ego_flow(self, points: np.ndarray) -> np.ndarray:
+        """Flow (N, 3) in metres that the sensor's own motion gives `points` (N, 3)."""
+        return pose.apply(self.ego_motion, points) - points
+
+    def residual_flow(self, points: np.ndarray) -> np.ndarray:
+        """Flow (N, 3) in metres that `points` (N, 3), the source scan's, do by themselves."""
+        return self.flow - self.ego_flow(points)
