@@ -1,0 +1,49 @@
+"""Small dense linear algebra that compiles to straight-line code."""
+
+import math
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True)
+def symmetric_eigen3(a00, a01, a02, a11, a12, a22, values, vectors):
+    """Eigenvalues (3,) ascending and unit eigenvectors (3, 3) as columns, by cyclic Jacobi rotations."""
+    m = np.empty((3, 3))
+    m[0, 0], m[0, 1], m[0, 2] = a00, a01, a02
+    m[1, 0], m[1, 1], m[1, 2] = a01, a11, a12
+    m[2, 0], m[2, 1], m[2, 2] = a02, a12, a22
+    for i in range(3):
+        for j in range(3):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    scale = a00 * a00 + a11 * a11 + a22 * a22
+    for _ in range(12):
+        if m[0, 1] ** 2 + m[0, 2] ** 2 + m[1, 2] ** 2 <= 1e-28 * scale:
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if m[p, q] == 0.0:
+                    continue
+                theta = (m[q, q] - m[p, p]) / (2.0 * m[p, q])
+                t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
+                if theta < 0.0:
+                    t = -t
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(3):
+                    mkp, mkq = m[k, p], m[k, q]
+                    m[k, p], m[k, q] = c * mkp - s * mkq, s * mkp + c * mkq
+                for k in range(3):
+                    mpk, mqk = m[p, k], m[q, k]
+                    m[p, k], m[q, k] = c * mpk - s * mqk, s * mpk + c * mqk
+                for k in range(3):
+                    vkp, vkq = vectors[k, p], vectors[k, q]
+                    vectors[k, p], vectors[k, q] = c * vkp - s * vkq, s * vkp + c * vkq
+    for i in range(3):
+        values[i] = m[i, i]
+    for i in range(2):
+        for j in range(2 - i):
+            if values[j] > values[j + 1]:
+                values[j], values[j + 1] = values[j + 1], values[j]
+                for k in range(3):
+                    vectors[k, j], vectors[k, j + 1] = vectors[k, j + 1], vectors[k, j]

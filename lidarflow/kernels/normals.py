@@ -1,0 +1,59 @@
+"""Surface normals by principal component analysis of a neighbourhood."""
+
+import numba
+import numpy as np
+
+from lidarflow.kernels import grid
+from lidarflow.kernels.linalg import symmetric_eigen3
+
+_MIN_NEIGHBOURS = 4
+_MIN_SPREAD = 1e-3   # a neighbourhood thinner than this share of its length is a line, not a surface
+
+
+def estimate(points: np.ndarray, surface: np.ndarray, radius_m: float) -> np.ndarray:
+    """Unit normals (N, 3) at `points` (N, 3), fitted to `surface` (S, 3) within `radius_m`.
+
+    They face the sensor at the origin. NaN where there are too few neighbours or they lie on a line.
+    """
+    order, keys, lower, shape = grid.build(surface, radius_m)
+    return _estimate(points, surface[order], keys, lower, shape, radius_m)
+
+
+@numba.njit(cache=True, parallel=True)
+def _estimate(points, surface, keys, lower, shape, radius_m):
+    normals = np.full((len(points), 3), np.nan)
+    radius_sq = radius_m * radius_m
+    for i in numba.prange(len(points)):
+        starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
+        values, vectors = np.empty(3), np.empty((3, 3))
+        p = points[i]
+        count = 0
+        sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
+        for run in range(grid.runs(p, keys, lower, shape, radius_m, starts, ends)):
+            for j in range(starts[run], ends[run]):
+                x, y, z = surface[j, 0] - p[0], surface[j, 1] - p[1], surface[j, 2] - p[2]
+                if x * x + y * y + z * z > radius_sq:
+                    continue
+                count += 1
+                sx += x
+                sy += y
+                sz += z
+                sxx += x * x
+                sxy += x * y
+                sxz += x * z
+                syy += y * y
+                syz += y * z
+                szz += z * z
+        if count < _MIN_NEIGHBOURS:
+            continue
+        mx, my, mz = sx / count, sy / count, sz / count
+        symmetric_eigen3(sxx / count - mx * mx, sxy / count - mx * my, sxz / count - mx * mz,
+                         syy / count - my * my, syz / count - my * mz, szz / count - mz * mz,
+                         values, vectors)
+        if values[1] <= _MIN_SPREAD * values[2]:
+            continue
+        facing = vectors[0, 0] * p[0] + vectors[1, 0] * p[1] + vectors[2, 0] * p[2]
+        sign = -1.0 if facing > 0.0 else 1.0
+        for k in range(3):
+            normals[i, k] = sign * vectors[k, 0]
+    return normals

@@ -1,0 +1,46 @@
+"""What one scan brings to any pair it is part of: masks, surface, normals, keypoints, descriptors, mesh."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarflow.config import Config
+from lidarflow.kernels import grid, normals, shot
+from lidarflow.lidar import ground, preparation
+from lidarflow.types import Scan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """A prepared scan.
+
+    usable       (N,) bool          finite and within the range limits
+    ground       (N,) bool          the ground among them
+    surface      (S, 3) float64     thinned non-ground points, metres
+    keypoint     (K,) int64         rows of the scan
+    descriptors  (K, 352) float32   SHOT of each keypoint, unit norm
+    """
+
+    usable: np.ndarray
+    ground: np.ndarray
+    surface: np.ndarray
+    keypoint: np.ndarray
+    descriptors: np.ndarray
+
+
+def extract(scan: Scan, config: Config) -> Features:
+    """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid and their descriptors."""
+    usable = preparation.usable(scan.points, config.preparation)
+    on_ground = ground.detect(scan.points, usable, config.ground)
+    rows = np.flatnonzero(usable & ~on_ground)
+    surface = _thinned(scan.points[rows], config.shot.surface_voxel_m)
+    keypoint = rows[grid.first_per_voxel(scan.points[rows], config.matching.keypoint_voxel_m)]
+    descriptors, _ = shot.describe(
+        scan.points[keypoint], surface, normals.estimate(surface, surface, config.normals.radius_m),
+        config.shot.radius_m, config.shot.min_neighbours)
+    described = np.isfinite(descriptors[:, 0])
+    return Features(usable, on_ground, surface, keypoint[described], descriptors[described])
+
+
+def _thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
+    return points if voxel_m == 0 else points[grid.first_per_voxel(points, voxel_m)]

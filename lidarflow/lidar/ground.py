@@ -1,0 +1,91 @@
+"""Ground points by Patchwork++ (Lee, Lim, Myung 2022), for sensors at any height."""
+
+import contextlib
+import os
+import sys
+
+import numpy as np
+
+from lidarflow.config import GroundConfig
+
+_PATCHWORK_HEIGHT_M = 1.723   # the height Patchwork++ is tuned for; clouds are shifted to it
+_CELL_M = 2.0
+_NEAR_M = 20.0
+_MIN_CELL_POINTS = 5
+_MIN_CLOUD_POINTS = 50
+_PATCHWORK_MIN_RANGE_M = 1.0
+
+
+def detect(points: np.ndarray, kept: np.ndarray, config: GroundConfig) -> np.ndarray:
+    """Mask (N,) of the ground among the `kept` rows of points (N, 3), metres, z up, sensor frame."""
+    ground = np.zeros(len(points), bool)
+    rows = np.flatnonzero(kept)
+    if len(rows) < _MIN_CLOUD_POINTS:
+        return ground
+    height_m = config.sensor_height_m or estimate_sensor_height(points[rows])
+    if height_m is None:
+        return ground
+    shifted = points[rows].astype(np.float32)
+    shifted[:, 2] += height_m - _PATCHWORK_HEIGHT_M
+    found = rows[_patchwork(shifted)]
+    ground[found] = _close_to_local_ground(points[found], config.max_height_m)
+    return ground
+
+
+def estimate_sensor_height(points: np.ndarray) -> float | None:
+    """Height in metres of the origin over the ground around it, None for a cloud without near points.
+
+    The lowest points of cells around the sensor are ground where ground is seen; the lower quartile of
+    those leaves out cells that only show walls.
+    """
+    near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR_M]
+    lowest, counts, _ = _lowest_per_cell(near)
+    trusted = lowest[counts >= _MIN_CELL_POINTS]
+    return float(-np.quantile(trusted, 0.25)) if len(trusted) else None
+
+
+def _close_to_local_ground(points: np.ndarray, max_height_m: float) -> np.ndarray:
+    """Mask (N,) of the points at most `max_height_m` over the lowest ground of their cell."""
+    lowest, _, cell = _lowest_per_cell(points)
+    slope_allowance_m = 0.1 * _CELL_M
+    return points[:, 2] - lowest[cell] <= max_height_m + slope_allowance_m
+
+
+def _lowest_per_cell(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lowest z and count (C,) of each occupied cell, and the cell (N,) of each point."""
+    columns = np.floor(points[:, :2] / _CELL_M).astype(np.int64)
+    columns -= columns.min(axis=0) if len(columns) else 0
+    stride = columns[:, 1].max() + 1 if len(columns) else 1
+    _, cell, counts = np.unique(columns[:, 0] * stride + columns[:, 1], return_inverse=True, return_counts=True)
+    lowest = np.full(len(counts), np.inf)
+    np.minimum.at(lowest, cell, points[:, 2])
+    return lowest, counts, cell
+
+
+def _patchwork(points: np.ndarray) -> np.ndarray:
+    """Row numbers of the ground in points (N, 3) float32 of a sensor at Patchwork++'s own height."""
+    import pypatchworkpp
+
+    parameters = pypatchworkpp.Parameters()
+    parameters.verbose = False
+    parameters.enable_RNR = False   # noise removal by intensity: clouds here need not have any
+    parameters.sensor_height = _PATCHWORK_HEIGHT_M
+    parameters.min_range = _PATCHWORK_MIN_RANGE_M
+    with _silent_stdout():
+        estimator = pypatchworkpp.patchworkpp(parameters)
+        estimator.estimateGround(np.column_stack([points, np.zeros(len(points), np.float32)]))
+    return np.asarray(estimator.getGroundIndices(), np.int64)
+
+
+@contextlib.contextmanager
+def _silent_stdout():
+    """Send the process's standard output to nowhere: the extension greets on it whatever `verbose` says."""
+    sys.stdout.flush()
+    saved, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(saved, 1)
+        os.close(saved)
+        os.close(nowhere)

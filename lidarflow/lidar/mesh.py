@@ -1,0 +1,90 @@
+"""The triangle mesh that says which points are neighbours, and its connected components."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from lidarflow.config import MeshConfig
+from lidarflow.kernels import mesh as kernel
+from lidarflow.lidar import rings
+
+# Marton et al. 2009 ask for angles of 10 to 120 degrees; scan lines lie farther apart than points along
+# them, so slim triangles are the rule here and the lower limit is relaxed.
+_MIN_ANGLE_RAD = np.radians(2.0)
+_MAX_ANGLE_RAD = np.radians(120.0)
+_MAX_SURFACE_ANGLE_RAD = np.radians(45.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """Triangles over a cloud, as a graph.
+
+    triangles  (T, 3) int32
+    edges      (E, 2) int32   unique, i < j, each the side of a triangle
+    component  (N,) int32     connected component of each point, 0 .. C-1; lone points are their own
+    method     str            "grid" or "tangent": how the triangles were found
+    """
+
+    triangles: np.ndarray
+    edges: np.ndarray
+    component: np.ndarray
+    method: str
+
+
+def build(points: np.ndarray, kept: np.ndarray, normals: np.ndarray, config: MeshConfig) -> Mesh:
+    """Mesh of the `kept` rows of a whole scan.
+
+    points (N, 3) metres in the sensor frame and file order; kept (N,) bool; normals (N, 3), used by the
+    tangent-plane method only. Spinning sensors are meshed along their scan grid (rings × azimuth), every
+    other cloud by local triangulation in tangent planes (after Marton et al. 2009).
+    """
+    ring = None if config.method == "tangent" else rings.recover(points)
+    if ring is None:
+        method, triangles = "tangent", _tangent_triangles(points, kept, normals, config)
+    else:
+        method, triangles = "grid", _grid_triangles(points, kept, ring, config)
+    edges = unique_edges(triangles)
+    return Mesh(triangles, edges, components(edges, len(points)), method)
+
+
+def _grid_triangles(
+    points: np.ndarray, kept: np.ndarray, ring: np.ndarray, config: MeshConfig
+) -> np.ndarray:
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    rows = np.flatnonzero(kept & (ring >= 0))
+    order = rows[np.lexsort((azimuth[rows], ring[rows]))]
+    bounds = np.searchsorted(ring[order], np.arange(ring.max() + 2))
+    return kernel.ring_strips(points, azimuth, order, bounds, *_limits(config))
+
+
+def _tangent_triangles(
+    points: np.ndarray, kept: np.ndarray, normals: np.ndarray, config: MeshConfig
+) -> np.ndarray:
+    rows = np.flatnonzero(kept)
+    if len(rows) < 3:
+        return np.empty((0, 3), np.int32)
+    local = kernel.tangent_stars(
+        points[rows], normals[rows], *_limits(config), _MAX_SURFACE_ANGLE_RAD, _MIN_ANGLE_RAD, _MAX_ANGLE_RAD)
+    return rows[local].astype(np.int32)
+
+
+def _limits(config: MeshConfig) -> tuple[float, float, float, float]:
+    return (config.max_edge_m, np.radians(config.max_edge_deg), config.max_depth_jump_m,
+            np.radians(config.min_grazing_deg))
+
+
+def unique_edges(triangles: np.ndarray) -> np.ndarray:
+    """Edges (E, 2) int32, i < j, sorted and unique, of triangles (T, 3)."""
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
+    sides = np.sort(sides, axis=1).astype(np.int64)
+    n = np.int64(sides.max()) + 1 if len(sides) else np.int64(1)
+    keys = np.unique(sides[:, 0] * n + sides[:, 1])
+    return np.stack([keys // n, keys % n], axis=1).astype(np.int32)
+
+
+def components(edges: np.ndarray, count: int) -> np.ndarray:
+    """Component (count,) int32 of each of `count` points joined by edges (E, 2)."""
+    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int32)
