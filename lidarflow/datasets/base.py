@@ -1,0 +1,142 @@
+"""What a data set offers, and the part that all data sets of scan files share."""
+
+import itertools
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from lidarflow.datasets import clouds
+from lidarflow.datasets.kitti_correction import correct_vertical_angle
+from lidarflow.errors import DataError
+from lidarflow.types import Scan, Truth
+
+DEFAULT_PERIOD_NS = 100_000_000
+
+
+class Dataset(Protocol):
+    """A sequence of scans from one sensor, in order of time.
+
+    name    what messages call it, e.g. "kitti 00"
+    loader  the name that `open_dataset` knows it by
+    note    what was assumed while opening it, "" for nothing
+    """
+
+    name: str
+    loader: str
+    note: str
+
+    def __len__(self) -> int: ...
+
+    def scan(self, index: int) -> Scan:
+        """The scan at `index`, rows in the order of its file."""
+
+    def truth(self, index: int) -> Truth | None:
+        """What happened from the scan at `index` to the one at `index + 1`, where it is known."""
+
+    def world_from_sensor(self) -> np.ndarray | None:
+        """Given poses (N, 4, 4) of the sensor, one per scan, where they are known."""
+
+
+class ScanFiles:
+    """Scans in one file each; loaders add the truth and the poses that they know of.
+
+    files     in order of time
+    times_ns  one per file; None = read from the file names, else 10 Hz
+    correct   whether the KITTI vertical-angle correction is applied
+    """
+
+    loader = "folder"
+
+    def __init__(self, name: str, files: Sequence[Path], times_ns: Sequence[int] | None = None,
+                 correct: bool = False, notes: Sequence[str] = ()):
+        self.name = name
+        self.files = list(files)
+        self.times_ns = list(times_ns) if times_ns is not None else times_from_names(self.files)
+        self.correct = correct
+        assumed = ["KITTI vertical-angle correction on"] if correct else []
+        self.note = "; ".join([*assumed, *notes])
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def scan(self, index: int) -> Scan:
+        """The scan at `index`; DataError where there is none or its file is damaged."""
+        check_index(self, index)
+        points = self._read(self.files[index])
+        if self.correct:
+            points = correct_vertical_angle(points)
+        return Scan(points, self.times_ns[index], self.files[index].stem)
+
+    def truth(self, index: int) -> Truth | None:
+        """Nothing is known unless a loader says otherwise."""
+        return None
+
+    def world_from_sensor(self) -> np.ndarray | None:
+        """No poses unless a loader says otherwise."""
+        return None
+
+    def _read(self, file: Path) -> np.ndarray:
+        return clouds.read_points(file)
+
+
+def check_index(dataset: Dataset, index: int) -> None:
+    """Raise DataError unless `index` is one of the data set's scans."""
+    if not 0 <= index < len(dataset):
+        raise DataError(f"{dataset.name}: no scan {index}; there are {len(dataset)}, from 0 on")
+
+
+def frame_number(file: Path) -> int | None:
+    """The number that a file's stem ends in, e.g. 12 of scan00012.png."""
+    digits = re.search(r"\d+$", file.stem)
+    return int(digits.group()) if digits else None
+
+
+def times_from_names(files: Sequence[Path]) -> list[int]:
+    """Times in ns: the file names where all are increasing nanoseconds, else 10 Hz from 0 on."""
+    if files and all(re.fullmatch(r"\d{18,19}", file.stem) for file in files):
+        times_ns = [int(file.stem) for file in files]
+        if all(a < b for a, b in itertools.pairwise(times_ns)):
+            return times_ns
+    return [index * DEFAULT_PERIOD_NS for index in range(len(files))]
+
+
+def rows_of_scans(row_count: int, files: Sequence[Path]) -> list[int] | None:
+    """Which row of a table with `row_count` rows belongs to each file; None where it cannot be said.
+
+    A table has one row per file, or one per frame of the whole sequence, addressed by frame number.
+    """
+    if row_count == len(files):
+        return list(range(row_count))
+    numbers = [frame_number(file) for file in files]
+    if None in numbers or max(numbers) >= row_count:
+        return None
+    return numbers
+
+
+def load_truth(file: Path, scan_file: Path, next_file: Path) -> Truth | None:
+    """Truth of a scan and its successor from `file`, None where there is no such file.
+
+    A successor whose frame number is not the next one is not the scan the truth speaks of: None.
+    Raises DataError for a file that lacks a key or is not aligned with the scan.
+    """
+    numbers = frame_number(scan_file), frame_number(next_file)
+    if not file.is_file() or None in numbers or numbers[1] != numbers[0] + 1:
+        return None
+    arrays = clouds.load_arrays(file, ("flow", "valid", "dynamic", "track", "target_from_source"))
+    rows = len(clouds.read_points(scan_file))
+    if len(arrays["flow"]) != rows:
+        raise DataError(f"{file}: {len(arrays['flow'])} rows, but {scan_file.name} has {rows} points; "
+                        "expected one row per point")
+    try:
+        return Truth(
+            flow=arrays["flow"].astype(np.float64),
+            ego_motion=arrays["target_from_source"].astype(np.float64),
+            valid=arrays["valid"],
+            is_dynamic=arrays["dynamic"],
+            object_id=arrays["track"].astype(np.int64),
+        )
+    except ValueError as error:
+        raise DataError(f"{file}: {clouds.one_line(error)}") from None

@@ -1,0 +1,192 @@
+"""Point cloud files to arrays, every row kept in its place.
+
+Damaged files are refused: a reader either returns exactly the rows that the file declares, or raises
+DataError. (Open3D 0.20 fills the rows that it cannot read of .ply and ASCII .pcd with whatever was in
+memory, which is why these formats are read here.)
+"""
+
+import re
+import tokenize
+import warnings
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lidarflow.datasets import pcd, ply
+from lidarflow.datasets.kitti_correction import correct_vertical_angle, is_wanted
+from lidarflow.errors import DataError
+from lidarflow.types import Scan
+
+KITTI_POINT_BYTES = 16
+
+
+def read_points(path: Path) -> np.ndarray:
+    """Points (N, 3) float64 of a cloud file, metres, rows as in the file.
+
+    A row with a coordinate that is not finite becomes NaN as a whole. Raises DataError for a file that
+    is missing, damaged, empty or of an unknown kind.
+    """
+    path = Path(path)
+    _check_is_file(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise DataError(f"{path}: unknown kind of point cloud '{path.suffix}'; "
+                        f"known are {' '.join(_READERS)}")
+    try:
+        if path.stat().st_size == 0:
+            raise DataError(f"{path}: empty file (0 bytes); it was not written to the end, get it again")
+        with np.errstate(invalid="ignore"):     # a signalling NaN is a NaN
+            points = np.array(reader(path), dtype=np.float64, order="C")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except MemoryError:
+        raise DataError(f"{path}: its points do not fit into memory") from None
+    points[~np.isfinite(points).all(axis=1)] = np.nan
+    if not np.isfinite(points).any():
+        found = f"none of {len(points)} points is finite" if len(points) else "0 points"
+        raise DataError(f"{path}: empty scan ({found}); leave this file out")
+    return points
+
+
+def read_scan(path: Path, kitti_correction: str = "auto") -> Scan:
+    """One cloud file as a Scan; "auto" corrects .bin files that lie where KITTI puts them."""
+    path = Path(path)
+    points = read_points(path)
+    if is_wanted(kitti_correction, path.suffix.lower() == ".bin" and is_kitti_folder(path.parent)):
+        points = correct_vertical_angle(points)
+    return Scan(points, name=path.stem)
+
+
+def is_kitti_folder(folder: Path) -> bool:
+    """Whether a folder has the name that KITTI gives to folders of scans."""
+    folder = Path(folder).absolute()
+    return folder.name == "velodyne" or (folder.name == "data" and folder.parent.name == "velodyne_points")
+
+
+def list_clouds(folder: Path) -> list[Path]:
+    """The cloud files of a folder in natural order; DataError unless there are some of just one kind."""
+    files = visible_files(folder)
+    found = Counter(file.suffix.lower() for file in files)
+    kinds = [suffix for suffix in FOLDER_SUFFIXES if found[suffix]]
+    if not kinds:
+        raise DataError(f"{folder}: no {'/'.join(FOLDER_SUFFIXES)} files ({_found(folder, found)}); "
+                        "is this the 'velodyne' folder?")
+    if len(kinds) > 1:
+        counts = " and ".join(f"{found[kind]} {kind}" for kind in kinds)
+        raise DataError(f"{folder}: found {counts} files; expected scans of one kind, "
+                        "move the others out of this folder")
+    return natural_sorted(file for file in files if file.suffix.lower() == kinds[0])
+
+
+def visible_files(folder: Path) -> list[Path]:
+    """The files of a folder whose names do not begin with a dot; DataError where it cannot be listed."""
+    try:
+        return [file for file in Path(folder).iterdir() if file.is_file() and not file.name.startswith(".")]
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be listed ({error.strerror or error})") from None
+
+
+def natural_sorted(files) -> list[Path]:
+    """Files by name, numbers in names by value: scan2 comes before scan10."""
+    def key(file: Path) -> list:
+        parts = re.split(r"(\d+)", file.name)
+        return [int(part) if part.isdigit() else part for part in parts]
+
+    return sorted(files, key=key)
+
+
+def load_arrays(path: Path, keys: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """Arrays of an .npz file, those of `keys` or all; DataError where it is damaged or lacks one."""
+    if not zipfile.is_zipfile(path):
+        raise DataError(f"{path}: not an .npz archive, or a truncated one; get it again")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [key for key in keys if key not in archive.files]
+            if missing:
+                held = ", ".join(archive.files) or "nothing"
+                raise DataError(f"{path}: lacks {', '.join(missing)}; it holds {held}")
+            return {key: np.asarray(archive[key]) for key in keys or archive.files}
+    except (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError, SyntaxError,
+            tokenize.TokenError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError(f"{path}: not a readable .npz archive of plain arrays ({one_line(error)})") from None
+
+
+def one_line(error: BaseException) -> str:
+    """The first line of an error's text, or its kind where it has none."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def _check_is_file(path: Path) -> None:
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder; expected one point cloud file ({' '.join(_READERS)})")
+    if not path.exists():
+        raise DataError(f"{path}: no such file")
+    if not path.is_file():
+        raise DataError(f"{path}: not a regular file")
+
+
+def _found(folder: Path, found: Counter) -> str:
+    named = [f"{count} {suffix or 'without suffix'}" for suffix, count in found.most_common(3)]
+    folders = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and entry.name[0] != ".")
+    named += [f"folder{'s' if len(folders) > 1 else ''} {', '.join(folders[:4])}"] if folders else []
+    return f"found {', '.join(named)}" if named else "it is empty"
+
+
+def _read_bin(path: Path) -> np.ndarray:
+    size = path.stat().st_size
+    if size % KITTI_POINT_BYTES:
+        raise DataError(f"{path}: {size} bytes are not a multiple of {KITTI_POINT_BYTES} (float32 x y z "
+                        "reflectance per point); the file is truncated or of another format")
+    return np.fromfile(path, dtype="<f4").reshape(-1, 4)[:, :3]
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError, SyntaxError, tokenize.TokenError) as error:
+        raise DataError(f"{path}: not a readable .npy array ({one_line(error)})") from None
+    if not isinstance(array, np.ndarray):
+        array.close()
+        raise DataError(f"{path}: an .npz archive under the name of an .npy file; rename it")
+    return _columns(path, array)
+
+
+def _read_npz(path: Path) -> np.ndarray:
+    arrays = load_arrays(path)
+    if "points" in arrays:
+        return _columns(path, arrays["points"])
+    fitting = [key for key, array in arrays.items() if _is_cloud(array)]
+    if len(fitting) != 1:
+        shapes = ", ".join(f"{key} {array.shape}" for key, array in arrays.items()) or "nothing"
+        raise DataError(f"{path}: holds {shapes}; expected an array 'points' (N, 3)")
+    return _columns(path, arrays[fitting[0]])
+
+
+def _read_text(path: Path) -> np.ndarray:
+    try:
+        text = path.read_text(encoding="utf-8").replace(",", " ")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            array = np.loadtxt(text.splitlines(), ndmin=2)
+    except ValueError as error:
+        raise DataError(f"{path}: expected rows of numbers x y z ({one_line(error)})") from None
+    return _columns(path, array) if array.size else np.empty((0, 3))
+
+
+def _is_cloud(array: np.ndarray) -> bool:
+    return array.ndim == 2 and array.shape[1] >= 3 and array.dtype.kind in "fiu"
+
+
+def _columns(path: Path, array: np.ndarray) -> np.ndarray:
+    if not _is_cloud(array):
+        raise DataError(f"{path}: an array {array.shape} of {array.dtype}; expected numbers (N, 3) or wider")
+    return array[:, :3]
+
+
+_READERS = {".bin": _read_bin, ".pcd": pcd.read, ".ply": ply.read, ".xyz": _read_text, ".txt": _read_text,
+            ".npy": _read_npy, ".npz": _read_npz}
+FOLDER_SUFFIXES = tuple(suffix for suffix in _READERS if suffix != ".txt")

@@ -1,0 +1,104 @@
+"""Folders of cloud files: any sensor's, and KITTI's raw recordings."""
+
+from pathlib import Path
+
+import numpy as np
+
+from lidarflow.datasets import clouds, tables
+from lidarflow.datasets.base import ScanFiles, load_truth
+from lidarflow.datasets.kitti_correction import is_wanted
+from lidarflow.errors import DataError
+from lidarflow.types import Truth
+
+INDEXED_POSE_FILES = ("ego_poses.txt", "derived_ego_icp.txt")
+KITTI_FOLDERS = ("velodyne", "velodyne_points/data")
+
+
+class CloudFolder(ScanFiles):
+    """Every cloud file of a folder, in natural order of the names.
+
+    Times come from times.txt (seconds), from names that are nanoseconds, else 10 Hz is assumed. Poses
+    come from ego_poses.txt or derived_ego_icp.txt (frame number, 3x4) or *poses_kitti.txt (3x4), all of
+    the sensor.
+    """
+
+    loader = "folder"
+
+    def __init__(self, folder: Path, sequence: str | None = None, kitti_correction: str = "auto"):
+        folder = Path(folder)
+        files = clouds.list_clouds(folder / sequence if sequence else folder)
+        is_kitti = files[0].suffix.lower() == ".bin" and clouds.is_kitti_folder(files[0].parent)
+        times_ns, notes = _read_times(files[0].parent, files)
+        self._poses, pose_notes = _read_poses(files[0].parent, files)
+        super().__init__(folder_name(files[0].parent), files, times_ns, is_wanted(kitti_correction, is_kitti),
+                         [*notes, *pose_notes])
+
+    def world_from_sensor(self) -> np.ndarray | None:
+        """Given poses (N, 4, 4), where a file beside the scans holds them."""
+        return self._poses
+
+
+class KittiRaw(ScanFiles):
+    """A drive as KITTI's raw recordings lay it out: scans in velodyne_points/data, or in velodyne.
+
+    The vertical-angle correction is on for .bin files. Truth, where there is any, lies in
+    truth/<scan>.npz; poses as in CloudFolder.
+    """
+
+    loader = "kitti_raw"
+
+    def __init__(self, folder: Path, sequence: str | None = None, kitti_correction: str = "auto"):
+        self.folder = Path(folder) / sequence if sequence else Path(folder)
+        scan_folder = kitti_scan_folder(self.folder)
+        if scan_folder is None:
+            raise DataError(f"{self.folder}: no folder 'velodyne' or 'velodyne_points/data'; "
+                            "expected a KITTI drive")
+        files = clouds.list_clouds(scan_folder)
+        times_ns, notes = _read_times(self.folder, files)
+        self._poses, pose_notes = _read_poses(self.folder, files)
+        correct = is_wanted(kitti_correction, files[0].suffix.lower() == ".bin")
+        super().__init__(f"kitti_raw {folder_name(self.folder)}", files, times_ns, correct,
+                         [*notes, *pose_notes])
+
+    def truth(self, index: int) -> Truth | None:
+        """Truth of truth/<scan>.npz where there is such a file."""
+        if not 0 <= index < len(self) - 1:
+            return None
+        file = self.folder / "truth" / f"{self.files[index].stem}.npz"
+        return load_truth(file, self.files[index], self.files[index + 1])
+
+    def world_from_sensor(self) -> np.ndarray | None:
+        """Given poses (N, 4, 4), where a file beside the scan folder holds them."""
+        return self._poses
+
+
+def kitti_scan_folder(folder: Path) -> Path | None:
+    """The sub-folder that holds a KITTI drive's scans, None where there is none."""
+    for name in KITTI_FOLDERS:
+        if (folder / name).is_dir():
+            return folder / name
+    return None
+
+
+def folder_name(folder: Path) -> str:
+    """The name of a folder, also of "." and ".."."""
+    return folder.resolve().name
+
+
+def _read_times(folder: Path, files: list[Path]) -> tuple[list[int] | None, list[str]]:
+    dates, seconds = folder / "velodyne_points" / "timestamps.txt", folder / "times.txt"
+    if dates.is_file():
+        return tables.times_of_scans(dates, tables.read_dates(dates), files)
+    if seconds.is_file():
+        return tables.times_of_scans(seconds, tables.read_seconds(seconds), files)
+    return None, []
+
+
+def _read_poses(folder: Path, files: list[Path]) -> tuple[np.ndarray | None, list[str]]:
+    for name in INDEXED_POSE_FILES:
+        if (folder / name).is_file():
+            return tables.indexed_motions_of_scans(folder / name, files)
+    found = sorted(file for file in clouds.visible_files(folder) if file.name.endswith("poses_kitti.txt"))
+    if len(found) == 1:
+        return tables.motions_of_scans(found[0], files)
+    return None, [f"{len(found)} files *poses_kitti.txt, none of them used"] if found else []

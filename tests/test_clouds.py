@@ -1,0 +1,192 @@
+"""Reading cloud files: rows stay where the file has them, damaged files are one clear line."""
+
+import numpy as np
+import pytest
+from cloud_files import NAN, POINTS, WRITERS, message, write_bin, write_numpy, write_pcd, write_ply
+
+from lidarflow.datasets import read_points, read_scan
+from lidarflow.datasets.kitti_correction import correct_vertical_angle
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_rows_stay_where_the_file_has_them(tmp_path, name):
+    points = read_points(WRITERS[name](tmp_path / name))
+    assert points.dtype == np.float64 and points.flags.writeable
+    np.testing.assert_array_equal(points, POINTS)
+
+
+@pytest.mark.parametrize("name", ["out.pcd", "out.ply"])
+@pytest.mark.parametrize("ascii", [True, False])
+@pytest.mark.parametrize("compressed", [True, False])
+def test_files_of_open3d_are_read_row_by_row(tmp_path, name, ascii, compressed):
+    o3d = pytest.importorskip("open3d")
+    points = np.random.default_rng(1).normal(size=(500, 3)).round(1)
+    points[100] = NAN
+    points[200:300] = 0.0     # long runs of equal bytes, which LZF packs
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
+    assert o3d.t.io.write_point_cloud(str(tmp_path / name), cloud, write_ascii=ascii, compressed=compressed)
+    np.testing.assert_allclose(read_points(tmp_path / name), points, atol=1e-6)
+
+
+def test_infinite_rows_become_nan(tmp_path):
+    points = POINTS.copy()
+    points[2, 1] = np.inf
+    read = read_points(write_bin(tmp_path / "a.bin", points))
+    assert np.isnan(read[2]).all() and len(read) == len(points)
+
+
+def test_truncated_bin(tmp_path):
+    file = tmp_path / "a.bin"
+    file.write_bytes(b"\0" * 1003)
+    assert "1003 bytes are not a multiple of 16" in message(read_points, file)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".pcd", ".ply", ".npy", ".npz", ".xyz"])
+def test_empty_file(tmp_path, suffix):
+    file = tmp_path / f"a{suffix}"
+    file.touch()
+    assert "empty file (0 bytes)" in message(read_points, file)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.xyz", "a.npz"])
+def test_a_cloud_without_points(tmp_path, name):
+    file = tmp_path / name
+    if name == "a.xyz":
+        file.write_text("# nothing\n")
+    else:
+        write_numpy(file, POINTS[:0])
+    assert "empty scan (0 points)" in message(read_points, file)
+
+
+def test_a_cloud_without_a_finite_point(tmp_path):
+    file = write_bin(tmp_path / "a.bin", np.full((4, 3), NAN))
+    assert "empty scan (none of 4 points is finite)" in message(read_points, file)
+
+
+def test_what_is_not_a_cloud_file(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"x")
+    text = message(read_points, tmp_path / "a.jpg")
+    assert "unknown kind of point cloud '.jpg'; known are .bin .pcd" in text
+    assert "no such file" in message(read_points, tmp_path / "b.bin")
+    assert "is a folder" in message(read_points, tmp_path)
+
+
+@pytest.mark.parametrize("array, found", [
+    (np.zeros((5, 2)), "(5, 2) of float64"),
+    (np.zeros(9), "(9,) of float64"),
+    (np.zeros((5, 3), complex), "complex128"),
+    (np.array([["a", "b", "c"]]), "<U1"),
+    (np.array([{}, []], dtype=object), "not a readable .npy array"),
+])
+def test_wrong_npy(tmp_path, array, found):
+    np.save(tmp_path / "a.npy", array, allow_pickle=True)
+    assert found in message(read_points, tmp_path / "a.npy")
+
+
+def test_truncated_and_mislabelled_npy(tmp_path):
+    file = write_numpy(tmp_path / "a.npy")
+    file.write_bytes(file.read_bytes()[:-10])
+    assert "not a readable .npy array" in message(read_points, file)
+    write_numpy(tmp_path / "b.npz").rename(tmp_path / "b.npy")
+    assert "rename it" in message(read_points, tmp_path / "b.npy")
+
+
+def test_npz_prefers_points_and_refuses_a_choice(tmp_path):
+    np.savez(tmp_path / "a.npz", points=POINTS, flow=POINTS + 1)
+    np.testing.assert_array_equal(read_points(tmp_path / "a.npz"), POINTS)
+    np.savez(tmp_path / "b.npz", one=POINTS, two=POINTS)
+    assert "expected an array 'points' (N, 3)" in message(read_points, tmp_path / "b.npz")
+    (tmp_path / "c.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:-30])
+    assert "not an .npz archive, or a truncated one" in message(read_points, tmp_path / "c.npz")
+
+
+@pytest.mark.parametrize("storage, found", [
+    ("ascii", "header says 900000000 points, but 5 lines follow"),
+    ("binary", "header says 900000000 points of 22 bytes, but only 110 bytes follow"),
+    ("binary_compressed", "the file is damaged"),
+])
+def test_pcd_header_that_promises_too_much(tmp_path, storage, found):
+    file = write_pcd(tmp_path / "a.pcd", storage, declared=900_000_000)
+    assert found in message(read_points, file)
+
+
+@pytest.mark.parametrize("old, new, found", [
+    (b"FIELDS intensity x y z", b"FIELDS intensity a b c", "expected x, y and z among them"),
+    (b"SIZE 4 4 4 4 2", b"SIZE 4 4 4 4", "5 FIELDS, but 4 SIZE"),
+    (b"TYPE F F F F U", b"TYPE F F F Q U", "TYPE Q"),
+    (b"COUNT 1 1 1 1 3", b"COUNT 1 1 1 1 99999999999", "no more than 4096"),
+    (b"POINTS 5", b"POINTS 6", "POINTS says 6, WIDTH x HEIGHT 5"),
+    (b"POINTS 5", b"POINTS -5", "POINTS '-5'"),
+    (b"DATA ascii", b"DATA zipped", "DATA zipped; expected ascii"),
+    (b"DATA ascii", b"", "no line 'DATA'"),
+    (b"4.5 -5.0", b"4.5 abc", "expected lines of 7 numbers"),
+    (b"4.5 -5.0 6.25", b"4.5", "expected lines of 7 numbers"),
+])
+def test_damaged_pcd(tmp_path, old, new, found):
+    file = write_pcd(tmp_path / "a.pcd", "ascii")
+    content = file.read_bytes()
+    assert old in content
+    file.write_bytes(content.replace(old, new))
+    assert found in message(read_points, file)
+
+
+def test_packed_pcd_that_cannot_be_unpacked(tmp_path):
+    file = write_pcd(tmp_path / "a.pcd", "binary_compressed")
+    content = file.read_bytes()
+    start = content.index(b"compressed\n") + len(b"compressed\n") + 8
+    file.write_bytes(content[:start] + b"\xff\xff\xff" + content[start + 3:])
+    assert "cannot be unpacked" in message(read_points, file)
+    file.write_bytes(content[:-5])
+    assert "packed bytes announced" in message(read_points, file)
+
+
+@pytest.mark.parametrize("storage", ["ascii", "binary_little_endian"])
+def test_ply_header_that_promises_too_much(tmp_path, storage):
+    file = write_ply(tmp_path / "a.ply", storage, declared=900_000_000)
+    assert "header says 900000000 points" in message(read_points, file)
+
+
+@pytest.mark.parametrize("old, new, found", [
+    (b"ply\n", b"plx\n", "does not start with 'ply'"),
+    (b"format ascii", b"format utf8", "format 'utf8'"),
+    (b"element vertex 5\n", b"", "expected 'vertex' as the first"),
+    (b"property double y\n", b"", "expected x, y and z among them"),
+    (b"property uchar intensity", b"property list uchar int a", "expected plain numbers"),
+    (b"end_header\n", b"", "no line 'end_header'"),
+    (b"4.5 -5.0", b"4.5", "expected lines of 4 numbers"),
+])
+def test_damaged_ply(tmp_path, old, new, found):
+    file = write_ply(tmp_path / "a.ply", "ascii")
+    file.write_bytes(file.read_bytes().replace(old, new))
+    assert found in message(read_points, file)
+
+
+# --- the KITTI correction ---
+
+def test_correction_raises_by_205_thousandths_of_a_degree_and_keeps_rows():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(50, 3)) * 20
+    points[7], points[8], points[9], points[10] = NAN, 0.0, (0, 0, 5), (1, NAN, 2)
+    before = points.copy()
+    raised = correct_vertical_angle(points)
+    np.testing.assert_array_equal(points, before)
+    kept = [7, 8, 9, 10]
+    np.testing.assert_array_equal(raised[kept], points[kept])
+    others = np.setdiff1d(np.arange(50), kept)
+    elevation = [np.degrees(np.arctan2(p[others, 2], np.hypot(p[others, 0], p[others, 1])))
+                 for p in (points, raised)]
+    np.testing.assert_allclose(elevation[1] - elevation[0], 0.205, atol=1e-9)
+    np.testing.assert_allclose(*(np.linalg.norm(p[others], axis=1) for p in (points, raised)))
+
+
+def test_a_single_bin_is_corrected_where_kitti_puts_it(tmp_path):
+    inside = write_bin(tmp_path / "velodyne" / "7.bin")
+    raw = write_bin(tmp_path / "velodyne_points" / "data" / "7.bin")
+    outside = write_bin(tmp_path / "data" / "7.bin")
+    raised = correct_vertical_angle(POINTS)
+    np.testing.assert_allclose(read_scan(inside).points, raised)
+    np.testing.assert_allclose(read_scan(raw).points, raised)
+    np.testing.assert_allclose(read_scan(outside).points, POINTS)
+    np.testing.assert_allclose(read_scan(inside, "off").points, POINTS)
+    np.testing.assert_allclose(read_scan(outside, "on").points, raised)
+    assert read_scan(inside).name == "7"
