@@ -1,0 +1,263 @@
+"""Results on disk: flow files, poses, settings, and the folder of a run.
+
+Files are written aside and moved into place, so that a reader never meets half of one.
+"""
+
+import contextlib
+import json
+import os
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from lidarflow import pose
+from lidarflow.config import Config, to_dict
+from lidarflow.errors import DataError
+from lidarflow.types import FlowResult
+
+FLOW_FOLDER = "flow"
+CONFIG_FILE = "config.toml"
+RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", "metrics.json", "recording.rrd", "preview.png")
+LATEST = "latest"
+
+# name: (shape, after N for the arrays with a row per point; dtype kind)
+_ROW_ARRAYS = {"flow": ((3,), "f"), "points": ((3,), "f"), "motion": ((7,), "f"), "valid": ((), "b"),
+               "in_graph": ((), "b"), "is_dynamic": ((), "b")}
+_WHOLE_ARRAYS = {"ego_motion": ((4, 4), "f"), "config": ((), "U"), "stats": ((), "U")}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowFile:
+    """What a flow file holds, rows aligned with the source scan.
+
+    points      (N, 3) float32     the source scan, metres
+    flow        (N, 3) float32     metres, total: ego-motion included
+    motions     (N, 4, 4) float64  target_from_source of every point
+    valid       (N,) bool          the motion rests on evidence
+    in_graph    (N,) bool          the motion was solved for
+    is_dynamic  (N,) bool          moves over ground by itself
+    ego_motion  (4, 4) float64     target_from_source of the static world
+    config      dict               the settings it was made with
+    stats       dict               what the solver did
+    """
+
+    points: np.ndarray
+    flow: np.ndarray
+    motions: np.ndarray
+    valid: np.ndarray
+    in_graph: np.ndarray
+    is_dynamic: np.ndarray
+    ego_motion: np.ndarray
+    config: dict
+    stats: dict
+
+
+@contextlib.contextmanager
+def written_aside(path: Path) -> Iterator[Path]:
+    """A path to write to that replaces `path` when the block ends well and vanishes when it does not.
+
+    Missing folders are made. Raises DataError where the file system refuses.
+    """
+    path = Path(path)
+    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield aside
+            with aside.open("rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(aside, path)
+        finally:
+            aside.unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DataError(f"cannot write {path}: {reason}; free space or choose another --out") from error
+
+
+def save_flow(path: Path, points: np.ndarray, result: FlowResult, config: Config) -> None:
+    """Write a flow file (.npz) of the source scan's `points` (N, 3), metres, and its `result`.
+
+    The same input gives the same bytes. Raises ValueError where points and result differ in length.
+    """
+    if points.shape != result.flow.shape:
+        raise ValueError(f"save_flow: points {points.shape} do not match the flow {result.flow.shape}")
+    arrays = {
+        "points": points.astype(np.float32),
+        "flow": result.flow.astype(np.float32),
+        "motion": _rows_of_motions(result.motions),
+        "valid": result.valid,
+        "in_graph": result.in_graph,
+        "is_dynamic": result.is_dynamic,
+        "ego_motion": result.ego_motion.astype(np.float64),
+        "config": np.array(_to_json(to_dict(config))),
+        "stats": np.array(_to_json(asdict(result.stats))),
+    }
+    with written_aside(path) as aside, aside.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def load_flow(path: Path) -> FlowFile:
+    """Read a flow file; DataError where it is damaged, or not a flow file."""
+    arrays = _read_archive(Path(path))
+    count = len(arrays["flow"]) if arrays["flow"].ndim else 0
+    for name, (shape, kind) in (_ROW_ARRAYS | _WHOLE_ARRAYS).items():
+        expected = (count, *shape) if name in _ROW_ARRAYS else shape
+        array = arrays[name]
+        if array.shape != expected or array.dtype.kind != kind:
+            raise DataError(f"{path}: '{name}' is {array.shape} of {array.dtype}; expected {expected} "
+                            "of the kind that lidarflow writes")
+    try:
+        config, stats = json.loads(str(arrays["config"])), json.loads(str(arrays["stats"]))
+        motions = _motions_of_rows(arrays["motion"])
+    except ValueError as error:
+        raise DataError(f"{path}: damaged flow file ({_one_line(error)})") from None
+    ego_motion = arrays["ego_motion"].astype(np.float64)
+    if not pose.is_rigid(ego_motion, 1e-4) or not isinstance(config, dict) or not isinstance(stats, dict):
+        raise DataError(f"{path}: damaged flow file; its ego_motion, config or stats make no sense")
+    return FlowFile(arrays["points"], arrays["flow"], motions, arrays["valid"], arrays["in_graph"],
+                    arrays["is_dynamic"], ego_motion, config, stats)
+
+
+def write_poses_kitti(path: Path, world_from_sensor: np.ndarray) -> None:
+    """Write poses (N, 4, 4), a row-major 3x4 matrix per line."""
+    rows = world_from_sensor[:, :3].reshape(-1, 12)
+    _write_text(path, "".join(_joined(row) + "\n" for row in rows.tolist()))
+
+
+def write_poses_tum(path: Path, world_from_sensor: np.ndarray, times_ns: list[int]) -> None:
+    """Write poses (N, 4, 4) at `times_ns`: seconds tx ty tz qx qy qz qw per line."""
+    rows = pose.to_translation_quaternion(world_from_sensor).tolist()
+    lines = [f"{time_ns // 10**9}.{time_ns % 10**9:09d} {_joined(row)}\n"
+             for time_ns, row in zip((int(time_ns) for time_ns in times_ns), rows, strict=True)]
+    _write_text(path, "".join(lines))
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write plain or numpy data as JSON, keys sorted; numbers that are not finite become null."""
+    _write_text(path, _to_json(data, indent=2) + "\n")
+
+
+def write_toml(path: Path, config: Config) -> None:
+    """Write every setting, in a form that can be read back as a settings file."""
+    _write_text(path, tomli_w.dumps(to_dict(config)))
+
+
+def new_run_folder(out: Path) -> Path:
+    """`out`, made ready for the results of a run.
+
+    It may be missing, empty, or an earlier run, whose results are removed. Raises DataError for any
+    other folder: nothing that lidarflow did not write is touched.
+    """
+    out = Path(out)
+    try:
+        if out.exists() and not out.is_dir():
+            raise DataError(f"{out}: is a file; expected a folder for the results, choose another --out")
+        names = {entry.name for entry in out.iterdir()} if out.is_dir() else set()
+        if names and not _is_run(names):
+            some = ", ".join(sorted(names)[:3])
+            raise DataError(f"{out}: holds files that are not an earlier run's ({some}); "
+                            "choose a new or an empty folder as --out")
+        (out / FLOW_FOLDER).mkdir(parents=True, exist_ok=True)
+        for old in [*(out / FLOW_FOLDER).glob("*.npz"), *(out / name for name in RESULT_FILES)]:
+            old.unlink(missing_ok=True)
+    except OSError as error:
+        raise DataError(f"cannot write {out}: {error.strerror or error}; choose another --out") from error
+    return out
+
+
+def link_latest(run_dir: Path) -> Path | None:
+    """Let `latest` beside `run_dir` link to it, and return the link.
+
+    None, and nothing changed, where `latest` is a real file or folder or links cannot be made.
+    """
+    run_dir = Path(run_dir).absolute()
+    link = run_dir.parent / LATEST
+    if run_dir == link or (link.exists() and not link.is_symlink()):
+        return None
+    aside = link.with_name(f".{LATEST}.{os.getpid()}.part")
+    try:
+        aside.unlink(missing_ok=True)
+        aside.symlink_to(run_dir.name, target_is_directory=True)
+        os.replace(aside, link)
+    except OSError:
+        return None
+    return link
+
+
+def _is_run(names: set[str]) -> bool:
+    """Whether a folder with these entries is an earlier run, finished or cut short."""
+    return FLOW_FOLDER in names and (CONFIG_FILE in names or names == {FLOW_FOLDER})
+
+
+def _read_archive(path: Path) -> dict[str, np.ndarray]:
+    names = [*_ROW_ARRAYS, *_WHOLE_ARRAYS]
+    if not path.is_file():
+        found = "is a folder" if path.is_dir() else "no such file"
+        raise DataError(f"{path}: {found}; expected a flow file (.npz)")
+    if not zipfile.is_zipfile(path):
+        raise DataError(f"{path}: not an .npz archive, or a truncated one; expected a flow file")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [name for name in names if name not in archive.files]
+            if missing:
+                raise DataError(f"{path}: not a flow file, lacks {', '.join(missing)}; "
+                                "expected the output of 'lidarflow pair' or 'lidarflow run'")
+            return {name: np.asarray(archive[name]) for name in names}
+    except (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError, SyntaxError,
+            tokenize.TokenError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError(f"{path}: not a readable flow file ({_one_line(error)})") from None
+
+
+def _rows_of_motions(motions: np.ndarray) -> np.ndarray:
+    """Rows (N, 7) float32 of motions (N, 4, 4); NaN where a motion is not finite."""
+    rows = np.full((len(motions), 7), np.nan, dtype=np.float32)
+    known = np.isfinite(motions).all(axis=(1, 2))
+    if known.any():
+        rows[known] = pose.to_translation_quaternion(motions[known])
+    return rows
+
+
+def _motions_of_rows(rows: np.ndarray) -> np.ndarray:
+    """Motions (N, 4, 4) float64 of rows (N, 7); NaN where a row is not finite."""
+    motions = np.full((len(rows), 4, 4), np.nan)
+    known = np.isfinite(rows).all(axis=1)
+    if known.any():
+        motions[known] = pose.from_translation_quaternion(rows[known])
+    return motions
+
+
+def _to_json(data: Any, indent: int | None = None) -> str:
+    return json.dumps(_plain(data), sort_keys=True, indent=indent, allow_nan=False, ensure_ascii=False)
+
+
+def _plain(data: Any) -> Any:
+    """`data` in the types of JSON."""
+    if isinstance(data, dict):
+        return {str(key): _plain(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_plain(value) for value in data]
+    if isinstance(data, np.ndarray | np.generic):
+        return _plain(data.tolist())
+    if isinstance(data, float):
+        return data if np.isfinite(data) else None
+    return data
+
+
+def _write_text(path: Path, text: str) -> None:
+    with written_aside(path) as aside:
+        aside.write_text(text, encoding="utf-8")
+
+
+def _joined(row: list[float]) -> str:
+    return " ".join(f"{value:.12g}" for value in row)
+
+
+def _one_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

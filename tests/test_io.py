@@ -1,0 +1,235 @@
+"""Results on disk: the same bytes for the same input, never half a file, nothing foreign touched."""
+
+import json
+import os
+import time
+import zipfile
+
+import numpy as np
+import pytest
+from cloud_files import message
+
+from lidarflow import config as settings
+from lidarflow import io, pose
+from lidarflow.config import Config
+from lidarflow.types import FlowResult, SolveStats
+
+
+def some_stats(**changes):
+    numbers = {"variables": 4, "matches": 3, "edges": 3, "components": 1, "solved_components": 1,
+               "plain_iterations": 5, "robust_iterations": 2, "plain_initial_error": 2.5,
+               "plain_final_error": 0.5, "robust_initial_error": 0.5, "robust_final_error": 0.25,
+               "inliers": 3}
+    return SolveStats(solver="fast", stopped={"converged": 1}, **(numbers | changes))
+
+
+def some_result(count=5, seconds=1.0):
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(count, 3)) * 10
+    motions = pose.exp(rng.normal(size=(count, 6)) * 0.3)
+    flow = pose.apply(motions, points) - points
+    points[1] = flow[1] = np.nan
+    valid, in_graph, is_dynamic = rng.random((3, count)) < 0.5
+    result = FlowResult(flow=flow, motions=motions, valid=valid, in_graph=in_graph,
+                        is_dynamic=is_dynamic, ego_motion=pose.from_yaw(0.1, (1, 2, 3)),
+                        stats=some_stats(), seconds={"solve": seconds})
+    return points, result
+
+
+@pytest.fixture
+def saved(tmp_path):
+    points, result = some_result()
+    io.save_flow(tmp_path / "flow.npz", points, result, Config())
+    return tmp_path / "flow.npz"
+
+
+def change(file, **changes):
+    """Rewrite some arrays of an .npz file; None leaves one out."""
+    with np.load(file) as archive:
+        arrays = {name: archive[name] for name in archive.files} | changes
+    np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
+
+
+# --- flow files ---
+
+def test_a_flow_file_comes_back(saved):
+    points, result = some_result()
+    loaded = io.load_flow(saved)
+    np.testing.assert_allclose(loaded.points, points, rtol=1e-6)
+    np.testing.assert_allclose(loaded.flow, result.flow, rtol=1e-5)
+    np.testing.assert_allclose(loaded.motions, result.motions, atol=1e-5)
+    for name in ("valid", "in_graph", "is_dynamic", "ego_motion"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(result, name))
+    assert settings.updated(Config(), loaded.config) == Config()
+    assert SolveStats(**loaded.stats) == result.stats
+
+
+def test_a_flow_file_is_the_stable_contract(saved):
+    with np.load(saved, allow_pickle=False) as archive:
+        found = {name: (archive[name].shape, archive[name].dtype.kind) for name in archive.files}
+        dtypes = {name: archive[name].dtype for name in ("flow", "motion", "ego_motion")}
+    assert found["config"][1] == found["stats"][1] == "U"
+    assert found["valid"][1] == found["in_graph"][1] == found["is_dynamic"][1] == "b"
+    assert {name: shape for name, (shape, _) in found.items()} == {
+        "points": (5, 3), "flow": (5, 3), "motion": (5, 7), "valid": (5,), "in_graph": (5,),
+        "is_dynamic": (5,), "ego_motion": (4, 4), "config": (), "stats": ()}
+    assert dtypes == {"flow": np.float32, "motion": np.float32, "ego_motion": np.float64}
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path, monkeypatch):
+    for name, years, seconds in (("a.npz", 0, 1.0), ("b.npz", 3, 9.0)):
+        now = time.localtime(1.7e9 + years * 3.2e7)
+        monkeypatch.setattr(time, "localtime", lambda *_, now=now: now)
+        io.save_flow(tmp_path / name, *some_result(seconds=seconds), Config())
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+def test_motions_that_are_nan_stay_nan(tmp_path):
+    points, result = some_result()
+    result.motions[1] = np.nan
+    io.save_flow(tmp_path / "a.npz", points, result, Config())
+    motions = io.load_flow(tmp_path / "a.npz").motions
+    assert np.isnan(motions[1]).all() and pose.is_rigid(motions[[0, 2, 3, 4]], 1e-6)
+
+
+def test_points_and_result_must_match(tmp_path):
+    points, result = some_result()
+    with pytest.raises(ValueError, match="do not match"):
+        io.save_flow(tmp_path / "a.npz", points[:3], result, Config())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("changes, found", [
+    ({"flow": None, "stats": None}, "not a flow file, lacks flow, stats"),
+    ({"flow": np.zeros((5, 2), np.float32)}, "'flow' is (5, 2)"),
+    ({"flow": np.float32(3)}, "is () of float32"),
+    ({"motion": np.zeros((4, 7), np.float32)}, "'motion' is (4, 7) of float32; expected (5, 7)"),
+    ({"valid": np.zeros(5)}, "'valid' is (5,) of float64"),
+    ({"ego_motion": np.ones((4, 4))}, "damaged flow file"),
+    ({"motion": np.zeros((5, 7), np.float32)}, "damaged flow file"),
+    ({"config": np.array("{")}, "damaged flow file"),
+    ({"stats": np.array("[1]")}, "damaged flow file"),
+])
+def test_a_flow_file_with_wrong_content(saved, changes, found):
+    change(saved, **changes)
+    assert found in message(io.load_flow, saved)
+
+
+def test_what_is_not_a_flow_file(tmp_path, saved):
+    assert "no such file" in message(io.load_flow, tmp_path / "none.npz")
+    assert "is a folder" in message(io.load_flow, tmp_path)
+    (tmp_path / "text.npz").write_text("hello")
+    assert "not an .npz archive" in message(io.load_flow, tmp_path / "text.npz")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    assert "not an .npz archive" in message(io.load_flow, tmp_path / "array.npy")
+    content = saved.read_bytes()
+    saved.write_bytes(content[:len(content) // 2])
+    assert "truncated" in message(io.load_flow, saved)
+    saved.write_bytes(content[:200] + bytes(50) + content[250:])
+    assert "not a readable flow file" in message(io.load_flow, saved)
+
+
+def test_pickles_are_never_loaded(saved):
+    change(saved, config=np.array([{"a": 1}], dtype=object))
+    assert "not a readable flow file" in message(io.load_flow, saved)
+
+
+# --- poses, settings, JSON ---
+
+def test_poses_in_both_formats(tmp_path):
+    world_from_sensor = np.stack([pose.from_yaw(0.3 * i, (10 * i, 1, 2)) for i in range(3)])
+    io.write_poses_kitti(tmp_path / "k.txt", world_from_sensor)
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "k.txt").reshape(3, 3, 4), world_from_sensor[:, :3])
+    io.write_poses_tum(tmp_path / "t.txt", world_from_sensor, [0, 1_317_042_145_951_199_337, np.int64(5)])
+    lines = (tmp_path / "t.txt").read_text().splitlines()
+    assert lines[1].startswith("1317042145.951199337 10 1 2 0 0 ") and lines[2].startswith("0.000000005 ")
+    rows = np.array([line.split()[1:] for line in lines], float)
+    np.testing.assert_allclose(pose.from_translation_quaternion(rows), world_from_sensor, atol=1e-9)
+
+
+def test_json_has_no_nan(tmp_path):
+    data = {"b": np.float32(np.nan), "a": [np.int64(3), np.bool_(True), float("inf")],
+            "c": np.array([1.5, np.nan]), "d": None, "e": {"x": (1, "Grüße")}}
+    io.write_json(tmp_path / "m.json", data)
+    text = (tmp_path / "m.json").read_text(encoding="utf-8")
+    assert json.loads(text) == {"a": [3, True, None], "b": None, "c": [1.5, None], "d": None,
+                                "e": {"x": [1, "Grüße"]}}
+    assert text.index('"a"') < text.index('"b"') and "NaN" not in text
+
+
+def test_settings_come_back(tmp_path):
+    config = settings.load(overrides=("mesh.max_edge_m=0.5", "ego.refine=false"))
+    io.write_toml(tmp_path / "config.toml", config)
+    assert settings.load(tmp_path / "config.toml") == config
+
+
+# --- writing aside ---
+
+def test_a_failed_write_leaves_the_old_file_and_no_rest(tmp_path):
+    file = tmp_path / "a.txt"
+    file.write_text("old")
+    with pytest.raises(KeyboardInterrupt), io.written_aside(file) as aside:
+        aside.write_text("half")
+        raise KeyboardInterrupt
+    assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
+
+
+def test_a_file_system_that_refuses(tmp_path):
+    def fill_disk():
+        with io.written_aside(tmp_path / "a.txt") as aside:
+            aside.write_text("half")
+            raise OSError(28, "No space left on device")
+
+    text = message(fill_disk)
+    assert text.startswith(f"cannot write {tmp_path / 'a.txt'}: No space left on device; free space or")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").touch()
+    assert "cannot write" in message(io.write_json, tmp_path / "file" / "m.json", {})
+    (tmp_path / "folder.json").mkdir()
+    assert "cannot write" in message(io.write_json, tmp_path / "folder.json", {})
+
+
+def test_missing_folders_are_made(tmp_path):
+    io.write_json(tmp_path / "a" / "b" / "m.json", {})
+    assert (tmp_path / "a" / "b" / "m.json").read_text() == "{}\n"
+
+
+# --- run folders ---
+
+def test_a_run_folder_is_made_and_used_again(tmp_path):
+    run = io.new_run_folder(tmp_path / "runs" / "a")
+    assert (run / "flow").is_dir() and io.new_run_folder(run) == run, "a run cut short may be repeated"
+    io.write_toml(run / "config.toml", Config())
+    for name in ("flow/000007.npz", "metrics.json", "notes.txt"):
+        (run / name).write_text("old")
+    io.new_run_folder(run)
+    assert sorted(entry.name for entry in run.iterdir()) == ["config.toml", "flow", "notes.txt"]
+    assert not list((run / "flow").iterdir()), "an old frame would count as one of the new run"
+
+
+def test_foreign_folders_are_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    assert "not an earlier run's (thesis.tex)" in message(io.new_run_folder, tmp_path)
+    (tmp_path / "config.toml").touch()
+    assert "not an earlier run's" in message(io.new_run_folder, tmp_path)
+    assert "is a file" in message(io.new_run_folder, tmp_path / "thesis.tex")
+    assert sorted(os.listdir(tmp_path)) == ["config.toml", "thesis.tex"]
+    (tmp_path / "empty").mkdir()
+    assert (io.new_run_folder(tmp_path / "empty") / "flow").is_dir()
+
+
+def test_latest_links_to_the_newest_run(tmp_path):
+    for name in ("a", "b"):
+        run = io.new_run_folder(tmp_path / name)
+        assert io.link_latest(run) == tmp_path / "latest"
+        assert os.readlink(tmp_path / "latest") == name
+    assert sorted(os.listdir(tmp_path)) == ["a", "b", "latest"]
+    assert io.link_latest(tmp_path / "latest") is None
+
+
+def test_a_real_folder_called_latest_stays(tmp_path):
+    (tmp_path / "latest").mkdir()
+    assert io.link_latest(io.new_run_folder(tmp_path / "a")) is None
+    assert (tmp_path / "latest").is_dir() and not (tmp_path / "latest").is_symlink()
