@@ -1,0 +1,128 @@
+"""A bird's-eye picture of what moves where: x forward is up, y left is left."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from lidarflow import colour
+from lidarflow.types import FlowResult, ScanPair
+
+_TEXT = (220, 220, 220)
+_QUIET = (150, 150, 150)
+_SENSOR_M = 0.8
+
+
+def bird_eye(points: np.ndarray, colours: np.ndarray, is_dynamic: np.ndarray, residual_flow: np.ndarray,
+             half_width_m: float = 40.0, size_px: int = 1200, dt_s: float = 0.1,
+             caption: str = "") -> Image.Image:
+    """Picture of a scan from above, moving points on top, an arrow as long as each object moves in a second.
+
+    points, residual_flow (N, 3) metres, sensor frame; colours (N, 3) uint8; is_dynamic (N,) bool.
+    """
+    scale = size_px / (2.0 * half_width_m)
+    pixels = np.full((size_px, size_px, 3), colour.BACKGROUND, np.uint8)
+    _scatter(pixels, points[~is_dynamic], colours[~is_dynamic], scale, dot_px=max(1, size_px // 1000))
+    _scatter(pixels, points[is_dynamic], colours[is_dynamic], scale, dot_px=max(2, size_px // 240))
+    legend_px = size_px // 4
+    pixels[:legend_px, size_px - legend_px:] = colour.wheel(legend_px)
+    image = Image.fromarray(pixels)
+    draw = ImageDraw.Draw(image)
+    _draw_sensor(draw, scale, size_px)
+    tops, moved = colour.moving_objects(points, residual_flow, is_dynamic)
+    _draw_arrows(draw, tops, moved / dt_s, scale, size_px)
+    _draw_scale_bar(draw, scale, size_px)
+    margin = size_px // 50
+    draw.text((margin, margin), caption, _TEXT, colour.font(size_px / 50))
+    return image
+
+
+def write_preview(path: Path, pair: ScanPair, result: FlowResult) -> None:
+    """Write the bird's-eye picture of a pair's source scan as PNG, whatever the name of `path` ends in."""
+    points = pair.source.points
+    residual_flow = result.residual_flow(points)
+    colours = colour.scene_colours(points, residual_flow, result.is_dynamic, pair.dt_s)
+    caption = f"{pair.source.name}: {int(result.is_dynamic.sum())} of {len(points)} points move over ground"
+    image = bird_eye(points, colours, result.is_dynamic, residual_flow, dt_s=pair.dt_s, caption=caption)
+    image.save(path, format="PNG")
+
+
+def _to_pixel(points: np.ndarray, scale: float, size_px: int) -> np.ndarray:
+    """Column and row (..., 2) float of points (..., 3) in metres; `scale` in pixels per metre."""
+    return size_px / 2.0 - points[..., [1, 0]] * scale
+
+
+def _scatter(pixels: np.ndarray, points: np.ndarray, colours: np.ndarray, scale: float, dot_px: int) -> None:
+    """Draw square dots into `pixels` (H, H, 3); of several in one place the brightest stays."""
+    size_px = len(pixels)
+    finite = np.isfinite(points).all(axis=1)
+    points, colours = points[finite], colours[finite]
+    corner = np.floor(_to_pixel(points, scale, size_px) - (dot_px - 1) / 2.0).astype(int)
+    order = np.argsort(colours.sum(axis=1, dtype=int), kind="stable")
+    corner, colours = corner[order], colours[order]
+    for row_shift in range(dot_px):
+        for column_shift in range(dot_px):
+            column, row = corner[:, 0] + column_shift, corner[:, 1] + row_shift
+            inside = (column >= 0) & (column < size_px) & (row >= 0) & (row < size_px)
+            pixels[row[inside], column[inside]] = colours[inside]
+
+
+def _draw_sensor(draw: ImageDraw.ImageDraw, scale: float, size_px: int) -> None:
+    """A triangle at the sensor that points forward."""
+    outline = np.array([(1.5, 0, 0), (-1, 1, 0), (-0.5, 0, 0), (-1, -1, 0)]) * _SENSOR_M
+    draw.polygon([tuple(p) for p in _to_pixel(outline, scale, size_px)], fill=_TEXT)
+
+
+def _draw_arrows(draw: ImageDraw.ImageDraw, tops: np.ndarray, velocity: np.ndarray, scale: float,
+                 size_px: int) -> None:
+    """The way each object at `tops` (K, 3) goes in one second at its velocity (K, 3) in m/s."""
+    starts, tips = _to_pixel(tops, scale, size_px), _to_pixel(tops + velocity, scale, size_px)
+    inside = ((starts >= 0) & (starts < size_px)).all(axis=1)
+    starts, tips = starts[inside], tips[inside]
+    speed_m_per_s = np.hypot(velocity[inside, 0], velocity[inside, 1])
+    for start, tip in zip(starts, tips, strict=True):
+        _draw_arrow(draw, start, tip, size_px)
+    taken = [tuple(box) for box in np.hstack([np.minimum(starts, tips), np.maximum(starts, tips)])]
+    for tip, speed in zip(tips, speed_m_per_s, strict=True):
+        _label_arrow(draw, tip, float(speed), taken, size_px)
+
+
+def _draw_arrow(draw: ImageDraw.ImageDraw, start: np.ndarray, tip: np.ndarray, size_px: int) -> None:
+    """An arrow between two pixels (2,)."""
+    length_px = np.linalg.norm(tip - start)
+    if length_px < 1:
+        return
+    along = (tip - start) / length_px
+    across, head = np.array([-along[1], along[0]]), size_px / 90.0
+    neck = tip - along * head
+    draw.line([tuple(start), tuple(neck)], fill=colour.ARROW, width=max(2, size_px // 400))
+    draw.polygon([tuple(tip), tuple(neck + across * head * 0.5), tuple(neck - across * head * 0.5)],
+                 fill=colour.ARROW)
+
+
+def _label_arrow(draw: ImageDraw.ImageDraw, tip: np.ndarray, speed_m_per_s: float, taken: list,
+                 size_px: int) -> None:
+    """The speed beside the arrow's tip, unless it would cover one of the boxes `taken`, which it joins."""
+    text, font, gap = f"{speed_m_per_s:.1f} m/s", colour.font(size_px / 70), size_px / 90.0
+    for x, y, anchor in ((-1, 0, "rm"), (1, 0, "lm"), (0, -1, "mb"), (0, 1, "mt")):
+        place = (tip[0] + x * gap, tip[1] + y * gap)
+        box = draw.textbbox(place, text, font, anchor)
+        if not any(_overlap(box, other) for other in taken):
+            taken.append(box)
+            draw.text(place, text, colour.ARROW, font, anchor, stroke_width=2, stroke_fill=colour.BACKGROUND)
+            return
+
+
+def _overlap(a: tuple, b: tuple) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _draw_scale_bar(draw: ImageDraw.ImageDraw, scale: float, size_px: int, length_m: float = 10.0) -> None:
+    """A bar of `length_m` in the lower left corner."""
+    left, bottom = size_px // 50, size_px - size_px // 50
+    right, tick = left + length_m * scale, size_px // 150
+    draw.line([(left, bottom), (right, bottom)], fill=_QUIET, width=max(2, size_px // 600))
+    for end in (left, right):
+        draw.line([(end, bottom - tick), (end, bottom + tick)], fill=_QUIET, width=max(2, size_px // 600))
+    draw.text(((left + right) / 2, bottom - tick), f"{length_m:g} m", _QUIET, colour.font(size_px / 60),
+              anchor="mb")
