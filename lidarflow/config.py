@@ -39,11 +39,13 @@ class GroundConfig:
     max_height_m: float = setting(
         0.25, "points higher than this over the ground surface around them are not ground", low=0.02)
 
+    fill_height_m: float = setting(
+        0.12, "points within this height of the ground around them are ground as well", low=0)
+
 
 @dataclass(frozen=True, slots=True)
 class NormalsConfig:
-    neighbours: int = setting(12, "points a normal is fitted to, at most", low=4, high=100)
-    radius_m: float = setting(0.6, "how far those points may be", low=0.01)
+    radius_m: float = setting(0.6, "radius of the neighbourhood that a plane is fitted to", low=0.01)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,14 +62,14 @@ class MeshConfig:
 
 @dataclass(frozen=True, slots=True)
 class ShotConfig:
-    radius_m: float = setting(1.2, "radius of the neighbourhood that a descriptor sees", low=0.05)
+    radius_m: float = setting(1.6, "radius of the neighbourhood that a descriptor sees", low=0.05)
     surface_voxel_m: float = setting(0.1, "the surface is thinned to one point per voxel; 0 = all", low=0)
     min_neighbours: int = setting(10, "points with fewer neighbours get no descriptor", low=5)
 
 
 @dataclass(frozen=True, slots=True)
 class MatchingConfig:
-    keypoint_voxel_m: float = setting(0.3, "one keypoint per voxel", low=0.02)
+    keypoint_voxel_m: float = setting(0.15, "one keypoint per voxel", low=0.02)
     max_speed_m_per_s: float = setting(
         25.0, "largest plausible speed relative to the start value; sets the gate", low=0.1)
     mutual_radius_m: float = setting(
@@ -94,7 +96,7 @@ class SolverConfig:
         "point", "twist between neighbours seen at the point or at the sensor (the paper's)",
         choices=("point", "sensor"))
     data_weight: float = setting(1.0, "weight of a squared match residual in m²", low=0)
-    smoothness_weight: float = setting(1.0, "weight of a squared twist between neighbours", low=0)
+    smoothness_weight: float = setting(10.0, "weight of a squared twist between neighbours", low=0)
     max_iterations: int = setting(50, "Levenberg-Marquardt iterations per step and component", low=1)
     relative_tolerance: float = setting(1e-4, "stop when an iteration gains less than this share", low=0)
 
@@ -105,15 +107,16 @@ class EgoConfig:
         "auto", "auto = KISS-ICP in a sequence, two-scan registration for a pair",
         choices=("auto", "registration", "kiss_icp"))
     refine: bool = setting(True, "register the two scans once more, from the KISS-ICP motion")
-    voxel_m: float = setting(0.3, "clouds are thinned to this before registration", low=0.02)
+    voxel_m: float = setting(0.2, "clouds are thinned to this before registration", low=0.02)
 
 
 @dataclass(frozen=True, slots=True)
 class DynamicConfig:
     min_speed_m_per_s: float = setting(0.5, "slower residual motion counts as static", low=0)
     smoothing_rounds: int = setting(10, "how often residual motion is averaged over the mesh", low=0)
-    explained_m: float = setting(
-        0.1, "a point this close to the next scan after ego-motion alone is static", low=0)
+    min_gain_m: float = setting(
+        0.04, "how much nearer to the next scan its own motion must bring a moving point than ego-motion "
+        "does, averaged over the mesh", low=0)
 
 
 @dataclass(frozen=True, slots=True)

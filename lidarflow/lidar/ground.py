@@ -5,6 +5,7 @@ import os
 import sys
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from lidarflow.config import GroundConfig
 
@@ -14,6 +15,8 @@ _NEAR_M = 20.0
 _MIN_CELL_POINTS = 5
 _MIN_CLOUD_POINTS = 50
 _PATCHWORK_MIN_RANGE_M = 1.0
+_FILL_NEIGHBOURS = 8
+_FILL_RADIUS_M = 2.0
 
 
 def detect(points: np.ndarray, kept: np.ndarray, config: GroundConfig) -> np.ndarray:
@@ -29,7 +32,7 @@ def detect(points: np.ndarray, kept: np.ndarray, config: GroundConfig) -> np.nda
     shifted[:, 2] += height_m - _PATCHWORK_HEIGHT_M
     found = rows[_patchwork(shifted)]
     ground[found] = _close_to_local_ground(points[found], config.max_height_m)
-    return ground
+    return _filled(points, rows, ground, config.fill_height_m)
 
 
 def estimate_sensor_height(points: np.ndarray) -> float | None:
@@ -51,12 +54,34 @@ def _close_to_local_ground(points: np.ndarray, max_height_m: float) -> np.ndarra
     return points[:, 2] - lowest[cell] <= max_height_m + slope_allowance_m
 
 
+def _filled(points: np.ndarray, rows: np.ndarray, ground: np.ndarray, height_m: float) -> np.ndarray:
+    """`ground` with the other `rows` that lie within `height_m` of the ground around them.
+
+    Patchwork++ judges whole patches and now and then drops one in the middle of the road; its points lie on
+    rings that travel with the sensor and would pass for a moving object.
+    """
+    others = rows[~ground[rows]]
+    if not ground.any() or len(others) == 0:
+        return ground
+    surface = points[ground]
+    distance_m, nearest = cKDTree(surface[:, :2]).query(
+        points[others, :2], k=_FILL_NEIGHBOURS, distance_upper_bound=_FILL_RADIUS_M, workers=-1)
+    near = np.isfinite(distance_m)
+    heights = np.where(near, surface[np.minimum(nearest, len(surface) - 1), 2], np.nan)
+    enough = near.all(axis=1)
+    level = np.median(heights[enough], axis=1)
+    filled = ground.copy()
+    filled[others[enough]] = np.abs(points[others[enough], 2] - level) <= height_m
+    return filled
+
+
 def _lowest_per_cell(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lowest z and count (C,) of each occupied cell, and the cell (N,) of each point."""
     columns = np.floor(points[:, :2] / _CELL_M).astype(np.int64)
     columns -= columns.min(axis=0) if len(columns) else 0
     stride = columns[:, 1].max() + 1 if len(columns) else 1
-    _, cell, counts = np.unique(columns[:, 0] * stride + columns[:, 1], return_inverse=True, return_counts=True)
+    key = columns[:, 0] * stride + columns[:, 1]
+    _, cell, counts = np.unique(key, return_inverse=True, return_counts=True)
     lowest = np.full(len(counts), np.inf)
     np.minimum.at(lowest, cell, points[:, 2])
     return lowest, counts, cell

@@ -7,7 +7,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from lidarflow.config import MeshConfig
+from lidarflow.errors import DataError
 from lidarflow.kernels import mesh as kernel
+from lidarflow.kernels import normals
 from lidarflow.lidar import rings
 
 # Marton et al. 2009 ask for angles of 10 to 120 degrees; scan lines lie farther apart than points along
@@ -33,16 +35,23 @@ class Mesh:
     method: str
 
 
-def build(points: np.ndarray, kept: np.ndarray, normals: np.ndarray, config: MeshConfig) -> Mesh:
+def build(
+    points: np.ndarray, kept: np.ndarray, surface: np.ndarray, config: MeshConfig, normal_radius_m: float
+) -> Mesh:
     """Mesh of the `kept` rows of a whole scan.
 
-    points (N, 3) metres in the sensor frame and file order; kept (N,) bool; normals (N, 3), used by the
-    tangent-plane method only. Spinning sensors are meshed along their scan grid (rings × azimuth), every
-    other cloud by local triangulation in tangent planes (after Marton et al. 2009).
+    points (N, 3) metres in the sensor frame and file order; kept (N,) bool; surface (S, 3), the thinned
+    points that normals are fitted to where normals are needed. Spinning sensors are meshed along their scan
+    grid (rings × azimuth), every other cloud by local triangulation in tangent planes (after Marton et al.
+    2009). Raises DataError when the grid is asked for and the cloud has none.
     """
     ring = None if config.method == "tangent" else rings.recover(points)
+    if ring is None and config.method == "grid":
+        raise DataError("mesh.method = grid, but the rings of a spinning sensor cannot be told apart in this "
+                        "cloud; use auto or tangent")
     if ring is None:
-        method, triangles = "tangent", _tangent_triangles(points, kept, normals, config)
+        method = "tangent"
+        triangles = _tangent_triangles(points, kept, surface, config, normal_radius_m)
     else:
         method, triangles = "grid", _grid_triangles(points, kept, ring, config)
     edges = unique_edges(triangles)
@@ -52,21 +61,42 @@ def build(points: np.ndarray, kept: np.ndarray, normals: np.ndarray, config: Mes
 def _grid_triangles(
     points: np.ndarray, kept: np.ndarray, ring: np.ndarray, config: MeshConfig
 ) -> np.ndarray:
+    """Strips between neighbouring rings, then across whatever stands between the two ends of a surface.
+
+    A branch in front of a wall breaks the wall's strips twice: along the ring, mended by strips that leave
+    out the points no strip wanted, and across it, mended by strips from every ring to the next but one.
+    """
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     rows = np.flatnonzero(kept & (ring >= 0))
+    triangles = _strips(points, azimuth, rows, ring, config)
+    meshed = np.zeros(len(points), bool)
+    meshed[triangles.ravel()] = True
+    along = _strips(points, azimuth, rows[meshed[rows]], ring, config)
+    across = [
+        _strips(points, azimuth, rows[ring[rows] % 2 == parity], ring // 2, config) for parity in (0, 1)
+    ]
+    across = np.concatenate(across)
+    across = across[~meshed[across].all(axis=1)]
+    return np.concatenate([triangles, along, across])
+
+
+def _strips(
+    points: np.ndarray, azimuth: np.ndarray, rows: np.ndarray, ring: np.ndarray, config: MeshConfig
+) -> np.ndarray:
     order = rows[np.lexsort((azimuth[rows], ring[rows]))]
     bounds = np.searchsorted(ring[order], np.arange(ring.max() + 2))
     return kernel.ring_strips(points, azimuth, order, bounds, *_limits(config))
 
 
 def _tangent_triangles(
-    points: np.ndarray, kept: np.ndarray, normals: np.ndarray, config: MeshConfig
+    points: np.ndarray, kept: np.ndarray, surface: np.ndarray, config: MeshConfig, normal_radius_m: float
 ) -> np.ndarray:
     rows = np.flatnonzero(kept)
     if len(rows) < 3:
         return np.empty((0, 3), np.int32)
+    point_normals = normals.estimate(points[rows], surface, normal_radius_m)
     local = kernel.tangent_stars(
-        points[rows], normals[rows], *_limits(config), _MAX_SURFACE_ANGLE_RAD, _MIN_ANGLE_RAD, _MAX_ANGLE_RAD)
+        points[rows], point_normals, *_limits(config), _MAX_SURFACE_ANGLE_RAD, _MIN_ANGLE_RAD, _MAX_ANGLE_RAD)
     return rows[local].astype(np.int32)
 
 

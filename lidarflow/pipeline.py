@@ -1,0 +1,151 @@
+"""Two scans in, flow out: the method from start to end."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarflow import pose
+from lidarflow.config import Config
+from lidarflow.datasets import Dataset
+from lidarflow.errors import DataError
+from lidarflow.lidar import dynamic, ego, features, frontend, mesh, preparation, start
+from lidarflow.solve import gtsam_lm
+from lidarflow.types import FlowResult, Scan, ScanPair
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Previous:
+    """What one pair leaves for the next: its source points, its result, and its target's features."""
+
+    points: np.ndarray
+    result: FlowResult
+    target: features.Features
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Wall time of named stages, in seconds."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
+
+
+def estimate_flow(pair: ScanPair, config: Config | None = None) -> FlowResult:
+    """Dense rigid flow from one scan to the next; raises DataError for scans that cannot be used."""
+    return _estimate(pair, config or Config(), previous=None, ego_guess=None)[0]
+
+
+class FlowEstimator:
+    """Flow along a sequence: motions, features and ego-motion are carried from pair to pair."""
+
+    def __init__(self, config: Config | None = None):
+        self.config = config or Config()
+        limits = self.config.preparation
+        by_registration = self.config.ego.method == "registration"
+        self._odometry = None if by_registration else ego.Odometry(limits.min_range_m, limits.max_range_m)
+        self._scan: Scan | None = None
+        self._previous: Previous | None = None
+
+    def step(self, scan: Scan) -> FlowResult | None:
+        """Flow from the last scan to this one; None for the first."""
+        guess = None
+        if self._odometry is not None:
+            guess = self._odometry.step(_finite_in_range(scan, self.config))
+        source, self._scan = self._scan, scan
+        if source is None:
+            _require_points(scan, self.config)
+            return None
+        pair = ScanPair(source, scan)
+        result, target = _estimate(pair, self.config, self._previous, guess)
+        self._previous = Previous(source.points, result, target)
+        return result
+
+
+def run(dataset: Dataset, frames: list[int], config: Config) -> Iterator[tuple[ScanPair, FlowResult]]:
+    """Flow of every consecutive pair of `frames` of a data set, in order."""
+    estimator = FlowEstimator(config)
+    source = None
+    for frame in frames:
+        scan = dataset.scan(frame)
+        result = estimator.step(scan)
+        if result is not None:
+            yield ScanPair(source, scan), result
+        source = scan
+
+
+def _estimate(
+    pair: ScanPair, config: Config, previous: Previous | None, ego_guess: np.ndarray | None
+) -> tuple[FlowResult, features.Features]:
+    """The result of a pair and the features of its target."""
+    for scan in (pair.source, pair.target):
+        _require_points(scan, config)
+    timed = Stopwatch()
+    points = pair.source.points
+    with timed("features"):
+        source = previous.target if previous else features.extract(pair.source, config)
+        target = features.extract(pair.target, config)
+    with timed("ego-motion"):
+        ego_motion = _ego_motion(pair, source, target, ego_guess, config)
+    with timed("mesh"):
+        surface_mesh = mesh.build(
+            points, source.usable & ~source.ground, source.surface, config.mesh, config.normals.radius_m)
+    with timed("matching"):
+        start_motions = _start(points, previous, ego_motion, config)
+        graph = frontend.build_problem(pair, source, target, surface_mesh, start_motions, config)
+    with timed("solver"):
+        motions, solved, stats = gtsam_lm.solve(graph.problem, config.solver, config.graph.min_matches)
+    with timed("dense answer"):
+        in_graph = graph.variable >= 0
+        dense = np.tile(ego_motion, (len(points), 1, 1))
+        dense[in_graph] = motions[graph.variable[in_graph]]
+        valid = source.ground.copy()
+        valid[in_graph] = solved[graph.variable[in_graph]]
+        flow = pose.apply(dense, points) - points
+        residual_flow = flow - (pose.apply(ego_motion, points) - points)
+        is_dynamic = dynamic.detect(
+            points, residual_flow, in_graph & valid, surface_mesh.edges, ego_motion,
+            pair.target.points[target.usable], pair.dt_s, config.dynamic)
+    problem = graph.problem
+    return FlowResult(
+        flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds,
+        problem.points[problem.match_index], problem.match_target), target
+
+
+def _require_points(scan: Scan, config: Config) -> None:
+    limits = config.preparation
+    left = len(_finite_in_range(scan, config))
+    if left == 0:
+        raise DataError(
+            f"{scan.name}: none of {len(scan)} points lies between {limits.min_range_m:g} and "
+            f"{limits.max_range_m:g} m from the sensor; is the scan empty, or not in metres?")
+
+
+def _finite_in_range(scan: Scan, config: Config) -> np.ndarray:
+    return scan.points[preparation.usable(scan.points, config.preparation)]
+
+
+def _ego_motion(
+    pair: ScanPair, source: features.Features, target: features.Features, guess: np.ndarray | None,
+    config: Config,
+) -> np.ndarray:
+    """target_from_source (4, 4): KISS-ICP's, refined unless told otherwise, or by registration alone."""
+    if guess is not None and not config.ego.refine:
+        return guess
+    return ego.register(
+        pair.source.points[source.usable], pair.target.points[target.usable], guess, config.ego)
+
+
+def _start(
+    points: np.ndarray, previous: Previous | None, ego_motion: np.ndarray, config: Config
+) -> np.ndarray:
+    if previous is None or config.graph.start == "ego":
+        return np.tile(ego_motion, (len(points), 1, 1))
+    return start.carried(points, previous.points, previous.result, ego_motion)
