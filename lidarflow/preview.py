@@ -24,14 +24,14 @@ def bird_eye(points: np.ndarray, colours: np.ndarray, is_dynamic: np.ndarray, re
     pixels = np.full((size_px, size_px, 3), colour.BACKGROUND, np.uint8)
     _scatter(pixels, points[~is_dynamic], colours[~is_dynamic], scale, dot_px=max(1, size_px // 1000))
     _scatter(pixels, points[is_dynamic], colours[is_dynamic], scale, dot_px=max(2, size_px // 240))
-    legend_px = size_px // 4
-    pixels[:legend_px, size_px - legend_px:] = colour.wheel(legend_px)
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image)
     _draw_sensor(draw, scale, size_px)
     tops, moved = colour.moving_objects(points, residual_flow, is_dynamic)
     _draw_arrows(draw, tops, moved / dt_s, scale, size_px)
     _draw_scale_bar(draw, scale, size_px)
+    legend_px = size_px // 4
+    image.paste(Image.fromarray(colour.wheel(legend_px)), (size_px - legend_px, 0))
     margin = size_px // 50
     draw.text((margin, margin), caption, _TEXT, colour.font(size_px / 50))
     return image

@@ -35,7 +35,8 @@ def prepared(cloud: Path, config: Config) -> tuple[np.ndarray, np.ndarray, np.nd
 def pcl_descriptors(program, points, point_normals, keypoints, radius_m, threads):
     """PCL's descriptors (K, 352) and seconds, by the reference program."""
     with tempfile.TemporaryDirectory() as folder:
-        paths = [str(Path(folder) / name) for name in ("points.f32", "normals.f32", "keypoints.i32", "out.f32")]
+        names = ("points.f32", "normals.f32", "keypoints.i32", "out.f32")
+        paths = [str(Path(folder) / name) for name in names]
         points.astype(np.float32).tofile(paths[0])
         point_normals.astype(np.float32).tofile(paths[1])
         keypoints.astype(np.int32).tofile(paths[2])
@@ -69,7 +70,8 @@ def main() -> None:
         pcl_s.append(seconds)
     both = np.isfinite(ours[:, 0]) & np.isfinite(theirs[:, 0])
     cosine = np.einsum("ij,ij->i", ours[both], theirs[both])
-    print(f"described by ours {np.isfinite(ours[:, 0]).mean():.3f}, by PCL {np.isfinite(theirs[:, 0]).mean():.3f}")
+    described = [np.isfinite(d[:, 0]).mean() for d in (ours, theirs)]
+    print("share described: ours {:.3f}, PCL {:.3f}".format(*described))
     print(f"cosine similarity: median {np.median(cosine):.5f}, share above 0.99 {(cosine > 0.99).mean():.3f}")
     print(f"seconds, median of {options.repeat}: ours {np.median(ours_s):.3f}, PCL {np.median(pcl_s):.3f}, "
           f"PCL / ours {np.median(pcl_s) / np.median(ours_s):.2f}")

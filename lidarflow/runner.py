@@ -1,0 +1,191 @@
+"""A whole run: a data set in, a folder of results out."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from lidarflow import io, metrics, pipeline, pose, preview
+from lidarflow.config import Config
+from lidarflow.datasets import Dataset
+from lidarflow.errors import DataError
+from lidarflow.types import FlowResult, ScanPair, SolveStats, Truth
+
+
+@dataclass(frozen=True, slots=True)
+class Viewing:
+    """What a run shows and records.
+
+    record     write recording.rrd
+    visualize  open the viewer and show pairs as they are done
+    arrows     log the total flow of all points as arrows
+    """
+
+    record: bool = True
+    visualize: bool = False
+    arrows: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class PairReport:
+    """What is known of one pair once it is done: scores are None where there is no truth."""
+
+    frame: str
+    points: int
+    graph_points: int
+    moving_points: int
+    alignment: metrics.Alignment
+    scores: metrics.Scores | None
+    truth: str
+    stats: SolveStats
+    seconds: dict[str, float]
+
+
+def choose_frames(dataset: Dataset, jump: int, count: int | None) -> list[int]:
+    """Indices of the scans to process: from `jump` on, `count` of them; DataError for fewer than two."""
+    if jump < 0 or (count is not None and count < 0):
+        raise DataError(f"--jump {jump} and --n-scans {count} must not be negative")
+    last = len(dataset) if count is None else min(len(dataset), jump + count)
+    frames = list(range(jump, last))
+    if len(frames) < 2:
+        raise DataError(
+            f"{dataset.name}: {len(frames)} of {len(dataset)} scans selected; flow needs at least two, "
+            "see --n-scans and --jump")
+    return frames
+
+
+def process(
+    dataset: Dataset, frames: list[int], config: Config, out: Path, viewing: Viewing,
+    on_pair: Callable[[PairReport], None] = lambda report: None,
+) -> list[PairReport]:
+    """Process `frames` of a data set and write a run folder; `on_pair` hears of every finished pair.
+
+    Flow files are complete as soon as they appear; poses, metrics, recording and picture follow at the end.
+    Raises LidarflowError for input or output that cannot be used.
+    """
+    # The first pair is opened before the folder is touched: a bad data set leaves no empty run behind.
+    results = pipeline.run(dataset, frames, config)
+    first = next(results)
+    io.new_run_folder(out)
+    io.write_toml(out / io.CONFIG_FILE, config)
+    reports: list[PairReport] = []
+    world_from_sensor, times_ns = [np.eye(4)], []
+    with _recording(out / "recording.rrd", viewing) as stream:
+        for index, (pair, result) in zip(frames, _chained(first, results), strict=False):
+            begin = time.perf_counter()
+            io.save_flow(out / io.FLOW_FOLDER / f"{pair.source.name}.npz", pair.source.points, result, config)
+            report = _report(dataset, index, pair, result, config)
+            if stream is not None:
+                from lidarflow import viewer
+
+                score = (report.alignment.before, report.alignment.after)
+                viewer.log_pair(stream, index, pair, result, score, world_from_sensor[-1], viewing.arrows)
+            world_from_sensor.append(world_from_sensor[-1] @ pose.inverse(result.ego_motion))
+            times_ns.append(pair.source.time_ns)
+            with_output = {**report.seconds, "scores and output": time.perf_counter() - begin}
+            reports.append(replace(report, seconds=with_output))
+            on_pair(reports[-1])
+    poses = np.stack(world_from_sensor)
+    io.write_poses_kitti(out / "poses_kitti.txt", poses)
+    io.write_poses_tum(out / "poses_tum.txt", poses, [*times_ns, pair.target.time_ns])
+    with io.written_aside(out / "preview.png") as aside:
+        preview.write_preview(aside, pair, result)
+    io.write_json(out / "metrics.json", metrics_of(reports, config))
+    io.write_json(out / "timing.json", {r.frame: r.seconds for r in reports})
+    io.link_latest(out)
+    return reports
+
+
+def metrics_of(reports: list[PairReport], config: Config) -> dict:
+    """What metrics.json holds: the mean over pairs, and every pair; wall times are kept elsewhere."""
+    pairs = []
+    for report in reports:
+        values = asdict(report)
+        del values["seconds"]
+        pairs.append(values)
+    return {"crispness_sigma_m": config.crispness.sigma_m, "mean": mean_of(reports), "pairs": pairs}
+
+
+def mean_of(reports: list[PairReport]) -> dict[str, float]:
+    """Means over pairs of the main figures; figures without a value in a pair leave that pair out."""
+    rows = [figures_of(report) for report in reports]
+    names = dict.fromkeys(name for row in rows for name in row)
+    means = {}
+    for name in names:
+        values = np.array([row[name] for row in rows if name in row and np.isfinite(row[name])])
+        if len(values):
+            means[name] = float(values.mean())
+    return means
+
+
+def figures_of(report: PairReport) -> dict[str, float]:
+    """The main figures of one pair by name, units in the name."""
+    figures = {
+        "crispness_before": report.alignment.before,
+        "crispness_by_ego": report.alignment.by_ego,
+        "crispness_after": report.alignment.after,
+        "moving_points": float(report.moving_points),
+    }
+    if report.scores is not None:
+        s = report.scores
+        figures |= {
+            "epe_all_m": s.all.mean, "epe_static_m": s.static.mean, "epe_dynamic_m": s.dynamic.mean,
+            "epe_dynamic_median_m": s.dynamic.median, "graph_epe_static_m": s.graph_static.mean,
+            "graph_epe_dynamic_m": s.graph_dynamic.mean,
+            "graph_epe_dynamic_median_m": s.graph_dynamic.median, "t_e_m": s.t_e, "r_e_rad": s.r_e_rad,
+            "movers_found": s.movers_found, "false_movers": s.false_movers, "ego_error_m": s.ego_error_m,
+            "ego_error_deg": float(np.degrees(s.ego_error_rad)),
+        }
+    return figures
+
+
+def find_truth(dataset: Dataset, index: int, pair: ScanPair) -> tuple[Truth | None, str]:
+    """Truth of the pair at `index`, and where it comes from: "flow", "poses" or "none"."""
+    truth = dataset.truth(index)
+    if truth is not None:
+        return truth, "flow"
+    world_from_sensor = dataset.world_from_sensor()
+    if world_from_sensor is None:
+        return None, "none"
+    ego_motion = pose.inverse(world_from_sensor[index + 1]) @ world_from_sensor[index]
+    return metrics.static_truth(pair.source.points, ego_motion), "poses (every point taken as static)"
+
+
+def _report(
+    dataset: Dataset, index: int, pair: ScanPair, result: FlowResult, config: Config
+) -> PairReport:
+    truth, origin = find_truth(dataset, index, pair)
+    return PairReport(
+        frame=pair.source.name,
+        points=len(pair.source),
+        graph_points=int((result.in_graph & result.valid).sum()),
+        moving_points=int(result.is_dynamic.sum()),
+        alignment=metrics.alignment(pair.source, pair.target, result, config.crispness.sigma_m),
+        scores=None if truth is None else metrics.score(result, truth),
+        truth=origin,
+        stats=result.stats,
+        seconds=result.seconds,
+    )
+
+
+def _chained(first, rest) -> Iterator[tuple[ScanPair, FlowResult]]:
+    yield first
+    yield from rest
+
+
+@contextlib.contextmanager
+def _recording(path: Path, viewing: Viewing):
+    """The viewer's stream, its file moved into place once complete; None when nothing is to be shown."""
+    if not (viewing.record or viewing.visualize):
+        yield None
+        return
+    from lidarflow import viewer
+
+    with contextlib.ExitStack() as stack:
+        aside = stack.enter_context(io.written_aside(path)) if viewing.record else None
+        stream = viewer.open_recording(aside, spawn=viewing.visualize)
+        stack.callback(viewer.close, stream)
+        yield stream
