@@ -77,7 +77,7 @@ def process(
         for index, (pair, result) in zip(frames, _chained(first, results), strict=False):
             begin = time.perf_counter()
             io.save_flow(out / io.FLOW_FOLDER / f"{pair.source.name}.npz", pair.source.points, result, config)
-            report = _report(dataset, index, pair, result, config)
+            report = report_pair(dataset, index, pair, result, config)
             if stream is not None:
                 from lidarflow import viewer
 
@@ -154,9 +154,10 @@ def find_truth(dataset: Dataset, index: int, pair: ScanPair) -> tuple[Truth | No
     return metrics.static_truth(pair.source.points, ego_motion), "poses (every point taken as static)"
 
 
-def _report(
+def report_pair(
     dataset: Dataset, index: int, pair: ScanPair, result: FlowResult, config: Config
 ) -> PairReport:
+    """Scores of a finished pair, the one from the data set's scan `index` to the next."""
     truth, origin = find_truth(dataset, index, pair)
     return PairReport(
         frame=pair.source.name,

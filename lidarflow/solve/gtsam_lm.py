@@ -89,21 +89,37 @@ def _grouped(label: np.ndarray, count: int) -> list[np.ndarray]:
 
 def _solve_component(part: _Component, config: SolverConfig) -> tuple[np.ndarray, _Step, _Step]:
     smoothness = _smoothness_factors(part, config)
-    values = gtsam.Values()
-    for i, (motion, point) in enumerate(zip(part.initial, part.points, strict=True)):
-        values.insert(i, gtsam.Pose3(gtsam.Rot3(motion[:3, :3]), motion[:3, :3] @ point + motion[:3, 3]))
+    values = _values(part.initial, part.points)
     steps = []
     for noise in (_data_noise(config), _robust_data_noise(config)):
         graph = gtsam.NonlinearFactorGraph(smoothness)
-        for i, target in zip(part.match_index.tolist(), part.match_target, strict=True):
-            graph.add(gtsam.PoseTranslationPrior3D(i, target, noise))
+        graph.push_back(_data_factors(part, noise))
         values, step = _optimise(graph, values, config)
         steps.append(step)
+    return _motions(values, part.points), steps[0], steps[1]
+
+
+def _values(motions: np.ndarray, points: np.ndarray) -> gtsam.Values:
+    """The variables X_i = τ_i · Trans(p_i) of motions (M, 4, 4) at points (M, 3)."""
+    values = gtsam.Values()
+    for i, (motion, moved) in enumerate(zip(motions, pose.apply(motions, points), strict=True)):
+        values.insert(i, gtsam.Pose3(gtsam.Rot3(motion[:3, :3]), moved))
+    return values
+
+
+def _motions(values: gtsam.Values, points: np.ndarray) -> np.ndarray:
+    """Motions (M, 4, 4) of the variables at points (M, 3): τ_i = X_i · Trans(−p_i)."""
     at_point = gtsam.utilities.extractPose3(values)   # rows: rotation (9, row-major), translation (3)
-    rotation = at_point[:, :9].reshape(-1, 3, 3)
-    moved = at_point[:, 9:]
-    translation = moved - np.einsum("nij,nj->ni", rotation, part.points)
-    return pose.from_rotation_translation(rotation, translation), steps[0], steps[1]
+    rotation, moved = at_point[:, :9].reshape(-1, 3, 3), at_point[:, 9:]
+    return pose.from_rotation_translation(rotation, moved - np.einsum("nij,nj->ni", rotation, points))
+
+
+def _data_factors(part: _Component, noise) -> gtsam.NonlinearFactorGraph:
+    """Eq. 5 for every match: τ_i p_i − p'_i, the variable's own translation off its match."""
+    graph = gtsam.NonlinearFactorGraph()
+    for i, target in zip(part.match_index.tolist(), part.match_target, strict=True):
+        graph.add(gtsam.PoseTranslationPrior3D(i, target, noise))
+    return graph
 
 
 def _data_noise(config: SolverConfig):
