@@ -95,8 +95,8 @@ class SolverConfig:
     smoothness_frame: str = setting(
         "point", "twist between neighbours seen at the point or at the sensor (the paper's)",
         choices=("point", "sensor"))
-    data_weight: float = setting(1.0, "weight of a squared match residual in m²", low=0)
-    smoothness_weight: float = setting(10.0, "weight of a squared twist between neighbours", low=0)
+    data_weight: float = setting(1.0, "weight of a squared match residual in m²", low=1e-6)
+    smoothness_weight: float = setting(10.0, "weight of a squared twist between neighbours", low=1e-6)
     max_iterations: int = setting(50, "Levenberg-Marquardt iterations per step and component", low=1)
     relative_tolerance: float = setting(1e-4, "stop when an iteration gains less than this share", low=0)
 

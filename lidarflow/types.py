@@ -46,6 +46,7 @@ class Scan:
 
     def __post_init__(self):
         _check(f"{self.name}: points", self.points, (None, 3), "f")
+        object.__setattr__(self, "points", np.ascontiguousarray(self.points, np.float64))
 
     def __len__(self) -> int:
         return len(self.points)

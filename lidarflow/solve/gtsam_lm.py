@@ -66,7 +66,7 @@ class _Component:
 
 
 def _components(problem: FlowProblem):
-    """The components of a problem that have matches and edges, as `_Component`s in ascending order."""
+    """The components of a problem that have matches, as `_Component`s in ascending order."""
     count = int(problem.component.max()) + 1 if len(problem.component) else 0
     local = np.empty(len(problem.points), np.int64)
     rows_of = _grouped(problem.component, count)
@@ -115,7 +115,7 @@ def _motions(values: gtsam.Values, points: np.ndarray) -> np.ndarray:
 
 
 def _data_factors(part: _Component, noise) -> gtsam.NonlinearFactorGraph:
-    """Eq. 5 for every match: τ_i p_i − p'_i, the variable's own translation off its match."""
+    """The data term of every match: τ_i p_i − p'_i, the variable's own translation off its match."""
     graph = gtsam.NonlinearFactorGraph()
     for i, target in zip(part.match_index.tolist(), part.match_target, strict=True):
         graph.add(gtsam.PoseTranslationPrior3D(i, target, noise))
