@@ -66,17 +66,18 @@ def summarise(error: np.ndarray) -> ErrorSummary:
     return ErrorSummary(len(error), float(error.mean()), float(np.median(error)))
 
 
-def pose_errors(motions: np.ndarray, true_motion: np.ndarray) -> tuple[float, float]:
-    """The paper's t_e [m] and r_e [rad]: mean over points of the error of their motions (N, 4, 4).
+def pose_errors(points: np.ndarray, motions: np.ndarray, true_motion: np.ndarray) -> tuple[float, float]:
+    """The paper's t_e [m] and r_e [rad]: mean over points (N, 3) of the error of their motions (N, 4, 4).
 
     `true_motion` (4, 4) is what every one of the points did (Dewan et al. 2016, section V-A: a static
-    scene, where it is the ego-motion). A motion is compared at the sensor's origin, as the paper does.
+    scene, where it is the ego-motion). The translation is compared where the variable sits, at its point:
+    at the sensor's origin, a turn of the point in place would count by its distance from the sensor.
     """
     if len(motions) == 0:
         return float("nan"), float("nan")
     truth = np.broadcast_to(true_motion, motions.shape)
-    return (float(pose.translation_distance(truth, motions).mean()),
-            float(pose.rotation_distance(truth, motions).mean()))
+    off_m = np.linalg.norm(pose.apply(motions, points) - pose.apply(truth, points), axis=1)
+    return float(off_m.mean()), float(pose.rotation_distance(truth, motions).mean())
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,14 +97,15 @@ class Scores:
     ego_error_rad: float
 
 
-def score(result: FlowResult, truth: Truth) -> Scores:
-    """Errors of `result` over the rows the truth is valid for (and where the source point is finite)."""
+def score(points: np.ndarray, result: FlowResult, truth: Truth) -> Scores:
+    """Errors of `result` for the source scan's points (N, 3), over finite rows the truth is valid for."""
     known = truth.valid & np.isfinite(result.flow).all(axis=1)
     moving, still = known & truth.is_dynamic, known & ~truth.is_dynamic
     graph = result.in_graph & result.valid
     error = np.full(len(known), np.nan)
     error[known] = end_point_error(result.flow[known], truth.flow[known])
-    t_e, r_e = pose_errors(result.motions[still & graph], truth.ego_motion)
+    rows = still & graph
+    t_e, r_e = pose_errors(points[rows], result.motions[rows], truth.ego_motion)
     ego = result.ego_motion[None], truth.ego_motion[None]
     return Scores(
         all=summarise(error[known]),

@@ -48,21 +48,38 @@ def _ring_strips(points, azimuth, order, bounds, limits, triangles):
     for ring in range(len(bounds) - 2):
         i, i_end = bounds[ring], bounds[ring + 1]
         j, j_end = bounds[ring + 1], bounds[ring + 2]
-        while i < i_end and j < j_end and (i + 1 < i_end or j + 1 < j_end):
-            a, b = order[i], order[j]
-            upper_next = azimuth[order[i + 1]] if i + 1 < i_end else math.inf
-            lower_next = azimuth[order[j + 1]] if j + 1 < j_end else math.inf
-            if upper_next <= lower_next:
-                i += 1
-                c = order[i]
-            else:
-                j += 1
-                c = order[j]
+        if i == i_end or j == j_end:
+            continue
+        a, b = order[i], order[j]
+        while True:
+            upper, upper_azimuth = _next_on_ring(azimuth, order, bounds[ring], i, i_end)
+            lower, lower_azimuth = _next_on_ring(azimuth, order, bounds[ring + 1], j, j_end)
+            if upper < 0 and lower < 0:
+                break
+            c = upper if upper_azimuth <= lower_azimuth else lower
             if (continuous(points[a], points[b], limits) and continuous(points[a], points[c], limits)
                     and continuous(points[b], points[c], limits)):
                 triangles[count, 0], triangles[count, 1], triangles[count, 2] = a, b, c
                 count += 1
+            if upper_azimuth <= lower_azimuth:
+                i, a = i + 1, c
+            else:
+                j, b = j + 1, c
     return count
+
+
+@numba.njit(cache=True)
+def _next_on_ring(azimuth, order, start, here, end):
+    """Point after position `here` of a ring and its azimuth; past the last the first one, a turn on.
+
+    -1 and infinity at the end, which a ring with no point in the half turn across ±π has at its last point.
+    """
+    if here + 1 < end:
+        return order[here + 1], azimuth[order[here + 1]]
+    first_again = azimuth[order[start]] + 2.0 * math.pi
+    if here + 1 == end and first_again - azimuth[order[end - 1]] < math.pi:
+        return order[start], first_again
+    return -1, math.inf
 
 
 def tangent_stars(

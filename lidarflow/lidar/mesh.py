@@ -17,6 +17,7 @@ from lidarflow.lidar import rings
 _MIN_ANGLE_RAD = np.radians(2.0)
 _MAX_ANGLE_RAD = np.radians(120.0)
 _MAX_SURFACE_ANGLE_RAD = np.radians(45.0)
+_FRAGMENT_POINTS = 20   # smaller components are mended by strips that skip a ring
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,20 +65,24 @@ def _grid_triangles(
     """Strips between neighbouring rings, then across whatever stands between the two ends of a surface.
 
     A branch in front of a wall breaks the wall's strips twice: along the ring, mended by strips that leave
-    out the points no strip wanted, and across it, mended by strips from every ring to the next but one.
+    out the points no strip wanted, and across it, mended for the fragments by strips from every ring to the
+    next but one or two.
     """
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     rows = np.flatnonzero(kept & (ring >= 0))
     triangles = _strips(points, azimuth, rows, ring, config)
     meshed = np.zeros(len(points), bool)
     meshed[triangles.ravel()] = True
-    along = _strips(points, azimuth, rows[meshed[rows]], ring, config)
+    triangles = np.concatenate([triangles, _strips(points, azimuth, rows[meshed[rows]], ring, config)])
+
+    component = components(unique_edges(triangles), len(points))
+    is_fragment = np.bincount(component)[component] < _FRAGMENT_POINTS
     across = [
-        _strips(points, azimuth, rows[ring[rows] % 2 == parity], ring // 2, config) for parity in (0, 1)
+        _strips(points, azimuth, rows[ring[rows] % step == phase], ring // step, config)
+        for step in (2, 3) for phase in range(step)
     ]
     across = np.concatenate(across)
-    across = across[~meshed[across].all(axis=1)]
-    return np.concatenate([triangles, along, across])
+    return np.concatenate([triangles, across[is_fragment[across].any(axis=1)]])
 
 
 def _strips(
