@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from lidarflow.datasets import Dataset
     from lidarflow.runner import PairReport, Viewing
 
+_INTERRUPTED = 130     # what typer makes of Ctrl-C
+
 app = typer.Typer(
     help="Dense rigid scene flow: a rigid motion for every LiDAR point between consecutive scans.",
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -33,14 +35,20 @@ Arrows = Annotated[bool, typer.Option("--arrows", help="Also record the total fl
 
 def main() -> None:
     """Entry point: problems with data or settings become one line and exit code 1."""
+    # A terminal that lacks a letter shows another one; that is no reason to lose the results.
+    sys.stdout.reconfigure(errors="replace")
     try:
-        app()
+        app(prog_name="lidarflow")
     except LidarflowError as error:
         print(f"lidarflow: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(1)
-    except KeyboardInterrupt:
-        print("lidarflow: interrupted", file=sys.stderr)
-        sys.exit(130)
+    except (OSError, MemoryError) as error:
+        print(f"lidarflow: {' '.join(str(error).split()) or 'out of memory'}", file=sys.stderr)
+        sys.exit(1)
+    except SystemExit as stop:
+        if stop.code == _INTERRUPTED:
+            print("lidarflow: interrupted", file=sys.stderr)
+        raise
 
 
 def _show_version(wanted: bool) -> None:
@@ -75,19 +83,22 @@ def pair(
     from lidarflow.types import ScanPair
 
     settings = load(config, tuple(overrides or ()))
-    if out.suffix != ".npz":
-        raise LidarflowError(f"--out {out}: expected a file name ending in .npz")
+    for option, file, suffix in (("--out", out, ".npz"), ("--recording", recording, ".rrd"),
+                                 ("--picture", picture, ".png")):
+        if file is not None:
+            io.check_output(option, file, suffix, inputs=(source, target))
+    _check_live_view(visualize)
     correction = settings.preparation.kitti_correction
     scans = ScanPair(datasets.read_scan(source, correction), datasets.read_scan(target, correction))
     with _working(f"flow from {source.name} to {target.name}"):
         result = pipeline.estimate_flow(scans, settings)
-        io.save_flow(out, scans.source.points, result, settings)
         alignment = metrics.alignment(scans.source, scans.target, result, settings.crispness.sigma_m)
         if picture is not None:
             with io.written_aside(picture) as aside:
                 preview.write_preview(aside, scans, result)
         if recording is not None or visualize:
             _record_pair(recording, visualize, arrows, scans, result, alignment)
+        io.save_flow(out, scans.source.points, result, settings)
     from lidarflow.tables import pair_table
 
     _print(pair_table(scans, result, alignment))
@@ -118,10 +129,11 @@ def run(
 
     settings = load(config, tuple(overrides or ()))
     dataset = open_dataset(data, dataloader, sequence, settings.preparation.kitti_correction)
-    guessed = "" if dataloader else " (guessed; --dataloader overrides)"
-    print(f"reading {dataset.name}, {len(dataset)} scans, as {dataset.loader}{guessed}")
+    guessed = "" if dataloader else " (guessed from what lies there; --dataloader overrides)"
+    print(f"reading    {data}: {len(dataset)} scans")
+    print(f"loader     {dataset.loader}{guessed}")
     if dataset.note:
-        print(f"        {dataset.note}")
+        print(f"note       {dataset.note}")
     _process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans)
 
 
@@ -132,16 +144,27 @@ def view(
     save: Annotated[Path | None, typer.Option(help="Write a recording, open no viewer.")] = None,
 ) -> None:
     """Look at results in the rerun viewer."""
+    import shutil
     import tempfile
 
-    from lidarflow import viewer
+    from lidarflow import io, viewer
 
+    if save is not None:
+        io.check_output("--save", save, ".rrd", inputs=(what,))
     if what.is_dir() or what.suffix == ".rrd":
-        viewer.open_in_viewer(what / "recording.rrd" if what.is_dir() else what)
+        recording = io.find_recording(what)
+        if save is None:
+            viewer.open_in_viewer(recording)
+        else:
+            with io.written_aside(save) as aside:
+                shutil.copyfile(recording, aside)
+            print(f"recording  {save}")
     elif save is not None:
         _record_flow_file(what, target, save)
         print(f"recording  {save}")
     else:
+        io.load_flow(what)
+        viewer.require_display(f"make a recording with: lidarflow view {what} --save FILE.rrd")
         with tempfile.TemporaryDirectory() as folder:
             recording = Path(folder) / "flow.rrd"
             _record_flow_file(what, target, recording)
@@ -153,24 +176,25 @@ def demo(
     out: Out = Path("demo"),
     visualize: Visualize = False,
 ) -> None:
-    """A generated drive through a street: ray-cast, processed, scored against its truth, pictured."""
+    """Generate a drive, process it, score it and picture it."""
     from lidarflow import demo as generated
     from lidarflow.config import load
     from lidarflow.datasets import open_dataset
     from lidarflow.runner import Viewing
 
+    generated.check_folder(out)
     with _working("ray-casting a street"):
-        folder = generated.generate(out / "data")
+        folder = generated.generate(out / generated.DATA_FOLDER)
     # Generated scans have no calibration error to correct.
     settings = load(overrides=("preparation.kitti_correction=off",))
     dataset = open_dataset(folder, kitti_correction=settings.preparation.kitti_correction)
-    print(f"generated  {folder} ({len(dataset)} scans with truth, KITTI's layout)")
-    _process(dataset, settings, out / "run", Viewing(visualize=visualize), 0, None)
+    print(f"generated  {folder}: {len(dataset)} scans with truth, in KITTI's layout")
+    _process(dataset, settings, out / generated.RUN_FOLDER, Viewing(visualize=visualize), 0, None)
 
 
 @app.command(name="config")
 def show_config() -> None:
-    """Every setting with its default, the values it takes, and its effect."""
+    """List every setting with its default, effect and allowed values."""
     from lidarflow.tables import config_table
 
     _print(config_table())
@@ -182,22 +206,32 @@ def _process(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from lidarflow import runner
-    from lidarflow.tables import run_table
+    from lidarflow.tables import run_notes, run_table
 
+    _check_live_view(viewing.visualize)
     frames = runner.choose_frames(dataset, jump, n_scans)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=_console(sys.stderr)) as progress:
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
+               TimeElapsedColumn())
+    console = _console(sys.stderr)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("scan pairs", total=len(frames) - 1)
 
         def on_pair(report: "PairReport") -> None:
             progress.update(task, advance=1, description=f"scan pairs, {report.frame} done")
 
         reports = runner.process(dataset, frames, settings, out, viewing, on_pair)
-    _print(run_table(reports, settings))
+    print()
+    _print(run_table(reports))
+    print()
+    for note in run_notes(reports, settings):
+        print(note)
+    print()
     print(f"results    {out}")
+    print(f"metrics    {out / 'metrics.json'}")
+    print(f"picture    {out / 'preview.png'}   (the last pair)")
     if viewing.record:
-        print(f"recording  {out / 'recording.rrd'}   (lidarflow view {out})")
-    print(f"picture    {out / 'preview.png'}")
+        print(f"recording  {out / 'recording.rrd'}")
+        print(f"look at it with: lidarflow view {out}")
 
 
 def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None:
@@ -227,15 +261,26 @@ def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
         viewer.close(stream)
 
 
+def _check_live_view(wanted: bool) -> None:
+    """InstallError before any work where a viewer is wanted and none can be opened."""
+    if wanted:
+        from lidarflow import viewer
+
+        viewer.require_live_view()
+
+
 def _working(what: str):
     """A spinner on standard error while something long goes on."""
-    return _console(sys.stderr).status(what)
+    from rich.text import Text
+
+    return _console(sys.stderr).status(Text(what))
 
 
 def _console(file):
     from rich.console import Console
 
-    return Console(file=file)
+    # Names of files are shown as they are, not taken for markup or emoji.
+    return Console(file=file, markup=False, emoji=False, highlight=False)
 
 
 def _print(table) -> None:

@@ -24,7 +24,9 @@ from lidarflow.types import FlowResult
 
 FLOW_FOLDER = "flow"
 CONFIG_FILE = "config.toml"
-RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", "metrics.json", "recording.rrd", "preview.png")
+RECORDING_FILE = "recording.rrd"
+RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", "metrics.json", "timing.json", RECORDING_FILE,
+                "preview.png")
 LATEST = "latest"
 
 # name: (shape, after N for the arrays with a row per point; dtype kind)
@@ -149,6 +151,45 @@ def write_toml(path: Path, config: Config) -> None:
     _write_text(path, tomli_w.dumps(to_dict(config)))
 
 
+def check_output(option: str, path: Path, suffix: str, inputs: tuple[Path, ...] = ()) -> None:
+    """Raise DataError unless `path` may become a file: its kind, its folder, and that it is no input."""
+    if path.suffix != suffix:
+        raise DataError(f"{option} {path}: expected a file name ending in {suffix}")
+    if path.is_dir():
+        raise DataError(f"{option} {path}: is a folder; expected a file name")
+    if any(path.exists() and file.exists() and path.samefile(file) for file in inputs):
+        raise DataError(f"{option} {path}: is the input itself; choose another name")
+    _check_parents(option, path)
+
+
+def check_run_folder(out: Path) -> None:
+    """Raise DataError unless `out` is missing, empty or an earlier run: a folder that a run may fill."""
+    try:
+        if out.exists() and not out.is_dir():
+            raise DataError(f"{out}: is a file; expected a folder for the results, choose another --out")
+        names = {entry.name for entry in out.iterdir()} if out.is_dir() else set()
+    except OSError as error:
+        raise DataError(f"cannot write {out}: {error.strerror or error}; choose another --out") from error
+    if names and not _is_run(names):
+        some = ", ".join(sorted(names)[:3])
+        raise DataError(f"{out}: holds files that are not an earlier run's ({some}); "
+                        "choose a new or an empty folder as --out")
+    _check_parents("--out", out)
+
+
+def find_recording(what: Path) -> Path:
+    """The recording of a run folder, or `what` itself where it is no folder; DataError if there is none."""
+    recording = what / RECORDING_FILE if what.is_dir() else what
+    if recording.is_file():
+        return recording
+    if recording == what:
+        raise DataError(f"{what}: no such recording")
+    if (what / FLOW_FOLDER).is_dir():
+        raise DataError(f"{what}: a run without {RECORDING_FILE} (cut short, or made with --no-record); "
+                        f"run it again, or view one of its files in {FLOW_FOLDER}")
+    raise DataError(f"{what}: no {RECORDING_FILE}; expected a folder that 'lidarflow run' wrote")
+
+
 def new_run_folder(out: Path) -> Path:
     """`out`, made ready for the results of a run.
 
@@ -156,14 +197,8 @@ def new_run_folder(out: Path) -> Path:
     other folder: nothing that lidarflow did not write is touched.
     """
     out = Path(out)
+    check_run_folder(out)
     try:
-        if out.exists() and not out.is_dir():
-            raise DataError(f"{out}: is a file; expected a folder for the results, choose another --out")
-        names = {entry.name for entry in out.iterdir()} if out.is_dir() else set()
-        if names and not _is_run(names):
-            some = ", ".join(sorted(names)[:3])
-            raise DataError(f"{out}: holds files that are not an earlier run's ({some}); "
-                            "choose a new or an empty folder as --out")
         (out / FLOW_FOLDER).mkdir(parents=True, exist_ok=True)
         for old in [*(out / FLOW_FOLDER).glob("*.npz"), *(out / name for name in RESULT_FILES)]:
             old.unlink(missing_ok=True)
@@ -175,11 +210,15 @@ def new_run_folder(out: Path) -> Path:
 def link_latest(run_dir: Path) -> Path | None:
     """Let `latest` beside `run_dir` link to it, and return the link.
 
-    None, and nothing changed, where `latest` is a real file or folder or links cannot be made.
+    None, and nothing changed, where `latest` is anything else than a link to a run beside it, where the run
+    is the working folder or one above it (its neighbours are none of our business), or where links cannot
+    be made.
     """
-    run_dir = Path(run_dir).absolute()
+    run_dir = Path(os.path.abspath(run_dir))
     link = run_dir.parent / LATEST
-    if run_dir == link or (link.exists() and not link.is_symlink()):
+    if run_dir == link or (os.path.lexists(link) and not _links_to_a_run(link)):
+        return None
+    if run_dir.resolve() in (Path.cwd(), *Path.cwd().parents):
         return None
     aside = link.with_name(f".{LATEST}.{os.getpid()}.part")
     try:
@@ -189,6 +228,22 @@ def link_latest(run_dir: Path) -> Path | None:
     except OSError:
         return None
     return link
+
+
+def _links_to_a_run(link: Path) -> bool:
+    """Whether `link` is one that `link_latest` made: to a run beside it, or to one that is gone."""
+    if not link.is_symlink() or os.sep in os.readlink(link):
+        return False
+    return not link.exists() or (link.is_dir() and _is_run({entry.name for entry in link.iterdir()}))
+
+
+def _check_parents(option: str, path: Path) -> None:
+    """Raise DataError where a folder above `path` cannot be one, or cannot be written to."""
+    nearest = next(parent for parent in path.absolute().parents if os.path.exists(parent))
+    if not nearest.is_dir():
+        raise DataError(f"{option} {path}: {nearest} is a file; expected a folder")
+    if not os.access(nearest, os.W_OK):
+        raise DataError(f"{option} {path}: {nearest} cannot be written to; choose another {option}")
 
 
 def _is_run(names: set[str]) -> bool:

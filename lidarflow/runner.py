@@ -11,7 +11,7 @@ import numpy as np
 from lidarflow import io, metrics, pipeline, pose, preview
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
-from lidarflow.errors import DataError
+from lidarflow.errors import DataError, LidarflowError
 from lidarflow.types import FlowResult, ScanPair, SolveStats, Truth
 
 
@@ -46,8 +46,9 @@ class PairReport:
 
 def choose_frames(dataset: Dataset, jump: int, count: int | None) -> list[int]:
     """Indices of the scans to process: from `jump` on, `count` of them; DataError for fewer than two."""
-    if jump < 0 or (count is not None and count < 0):
-        raise DataError(f"--jump {jump} and --n-scans {count} must not be negative")
+    for option, value in (("--jump", jump), ("--n-scans", count)):
+        if value is not None and value < 0:
+            raise DataError(f"{option} {value}: must not be negative")
     last = len(dataset) if count is None else min(len(dataset), jump + count)
     frames = list(range(jump, last))
     if len(frames) < 2:
@@ -66,14 +67,15 @@ def process(
     Flow files are complete as soon as they appear; poses, metrics, recording and picture follow at the end.
     Raises LidarflowError for input or output that cannot be used.
     """
-    # The first pair is opened before the folder is touched: a bad data set leaves no empty run behind.
-    results = pipeline.run(dataset, frames, config)
+    # The first pair is done before the folder is touched: a bad data set leaves no empty run behind.
+    io.check_run_folder(out)
+    reports: list[PairReport] = []
+    results = _explained(pipeline.run(dataset, frames, config), dataset, frames, reports, out)
     first = next(results)
     io.new_run_folder(out)
     io.write_toml(out / io.CONFIG_FILE, config)
-    reports: list[PairReport] = []
     world_from_sensor, times_ns = [np.eye(4)], []
-    with _recording(out / "recording.rrd", viewing) as stream:
+    with _recording(out / io.RECORDING_FILE, viewing) as stream:
         for index, (pair, result) in zip(frames, _chained(first, results), strict=False):
             begin = time.perf_counter()
             io.save_flow(out / io.FLOW_FOLDER / f"{pair.source.name}.npz", pair.source.points, result, config)
@@ -165,7 +167,7 @@ def report_pair(
         graph_points=int((result.in_graph & result.valid).sum()),
         moving_points=int(result.is_dynamic.sum()),
         alignment=metrics.alignment(pair.source, pair.target, result, config.crispness.sigma_m),
-        scores=None if truth is None else metrics.score(result, truth),
+        scores=None if truth is None else metrics.score(pair.source.points, result, truth),
         truth=origin,
         stats=result.stats,
         seconds=result.seconds,
@@ -175,6 +177,18 @@ def report_pair(
 def _chained(first, rest) -> Iterator[tuple[ScanPair, FlowResult]]:
     yield first
     yield from rest
+
+
+def _explained(
+    results: Iterator, dataset: Dataset, frames: list[int], reports: list[PairReport], out: Path
+) -> Iterator:
+    """`results`; an error on the way also says where in the data set it is, and what is kept of the run."""
+    try:
+        yield from results
+    except LidarflowError as error:
+        index = frames[len(reports)]
+        kept = f"; the flow of {len(reports)} before is kept in {out / io.FLOW_FOLDER}" if reports else ""
+        raise type(error)(f"{error} (scans {index} and {index + 1} of {dataset.name}{kept})") from error
 
 
 @contextlib.contextmanager

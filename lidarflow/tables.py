@@ -4,31 +4,34 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from lidarflow import pose
 from lidarflow.config import Config, describe
 from lidarflow.metrics import Alignment
 from lidarflow.runner import PairReport, figures_of, mean_of
 from lidarflow.types import FlowResult, ScanPair
 
 _COLUMNS = {
-    "epe_static_m": "EPE [m]\nstatic", "epe_dynamic_m": "\nmoving",
-    "graph_epe_static_m": "of graph\nstatic", "graph_epe_dynamic_m": "\nmoving",
-    "movers_found": "movers\nfound %", "false_movers": "\nfalse %",
-    "crispness_before": "crisp\nbefore", "crispness_after": "\nafter",
-    "moving_points": "points\nmoving",
+    "epe_static_m": "EPE\nstatic\n[m]", "epe_dynamic_m": "EPE\nmoving\n[m]",
+    "graph_epe_static_m": "graph\nstatic\n[m]", "graph_epe_dynamic_m": "graph\nmoving\n[m]",
+    "movers_found": "movers\nfound\n[%]", "false_movers": "false\nmovers\n[%]",
+    "crispness_before": "crisp\nbefore", "crispness_after": "crisp\nafter",
+    "moving_points": "moving\npoints",
 }
 _SHARES = {"movers_found", "false_movers"}
+_POOR_CRISPNESS = 0.5
+_ODD_SIZE_RATIO = 2.0
+_DEFAULT_CHARS = 12
 
 
-def run_table(reports: list[PairReport], config: Config) -> Table:
-    """One row per pair and their mean; columns without a value anywhere are left out."""
+def run_table(reports: list[PairReport]) -> Table:
+    """One row per pair and their mean, 80 characters wide; columns without a value anywhere are left out."""
     rows = [figures_of(report) for report in reports]
     shown = [name for name in _COLUMNS if any(np.isfinite(row.get(name, np.nan)) for row in rows)]
-    caption = _caption(reports, config)
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), caption=caption, caption_justify="left")
-    table.add_column("scan", no_wrap=True, overflow="fold")
+    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, pad_edge=False)
+    table.add_column("scan", overflow="fold")
     for name in shown:
         table.add_column(_COLUMNS[name], justify="right", no_wrap=True)
-    table.add_column("time\n[s]", justify="right")
+    table.add_column("time\n[s]", justify="right", no_wrap=True)
     for report, row in zip(reports, rows, strict=True):
         table.add_row(report.frame, *(_text(name, row.get(name)) for name in shown),
                       f"{sum(report.seconds.values()):.1f}")
@@ -39,12 +42,29 @@ def run_table(reports: list[PairReport], config: Config) -> Table:
     return table
 
 
-def _caption(reports: list[PairReport], config: Config) -> str:
-    sigma = f"crispness with σ = {config.crispness.sigma_m:g} m, over the graph's own points"
+def run_notes(reports: list[PairReport], config: Config) -> list[str]:
+    """What the figures of `run_table` mean, and which pairs look wrong."""
+    notes = [f"crisp: crispness with σ = {config.crispness.sigma_m:g} m, 1 = aligned, of the graph's points"]
     if reports[0].scores is None:
-        return f"no truth found; {sigma}"
-    return (f"truth: {reports[0].truth}; graph = points the factor graph solved, the others have the "
-            f"ego-motion; {sigma}")
+        notes.insert(0, "truth: none found")
+    else:
+        notes = [f"truth: {reports[0].truth}", "EPE: mean end-point error of all points",
+                 "graph: the same of the points the graph solved; others have the ego-motion",
+                 *notes]
+    for report in reports:
+        doubt = _doubt(report.graph_points, report.alignment)
+        notes += [f"{report.frame}: {doubt}"] if doubt else []
+    return notes
+
+
+def _doubt(graph_points: int, alignment: Alignment) -> str:
+    """What makes a result doubtful, "" for nothing."""
+    if graph_points == 0:
+        return "no point found a match, so all of them have the ego-motion"
+    if alignment.after < _POOR_CRISPNESS:
+        return (f"crispness is only {alignment.after:.3f} after the flow; are these consecutive scans of one "
+                "sensor, in metres?")
+    return ""
 
 
 def _text(name: str, value: float | None) -> str:
@@ -58,22 +78,36 @@ def _text(name: str, value: float | None) -> str:
 def pair_table(pair: ScanPair, result: FlowResult, alignment: Alignment) -> Table:
     """What was found between two scans."""
     x, y, z = result.ego_motion[:3, 3]
+    turn_deg = np.degrees(np.linalg.norm(pose.log(result.ego_motion)[:3]))
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column()
     table.add_column()
     graph = result.in_graph & result.valid
     table.add_row("points", f"{len(pair.source)}, {graph.sum()} of them solved by the graph, "
                             f"{result.is_dynamic.sum()} moving by themselves")
-    table.add_row("ego-motion", f"target_from_source translation {x:.3f} {y:.3f} {z:.3f} m")
-    table.add_row("crispness", f"{alignment.before:.3f} before, {alignment.by_ego:.3f} by ego-motion, "
-                               f"{alignment.after:.3f} by the flow (σ = {alignment.sigma_m:g} m)")
+    table.add_row("ego-motion", f"translation {x:.3f} {y:.3f} {z:.3f} m, rotation {turn_deg:.2f} deg, "
+                                "target_from_source")
+    if graph.any():
+        table.add_row("crispness", f"{alignment.before:.3f} before, {alignment.by_ego:.3f} by ego-motion, "
+                                   f"{alignment.after:.3f} by the flow (σ = {alignment.sigma_m:g} m)")
+    counts = len(pair.source), len(pair.target)
+    odd_sizes = max(counts) > _ODD_SIZE_RATIO * min(counts)
+    if odd_sizes:
+        table.add_row("note", f"the scans have {counts[0]} and {counts[1]} points; are both of one sensor?")
+    doubt = _doubt(int(graph.sum()), alignment)
+    if doubt:
+        table.add_row("note", doubt)
     table.add_row("seconds", ", ".join(f"{stage} {s:.1f}" for stage, s in result.seconds.items()))
     return table
 
 
 def config_table() -> Table:
-    """Every setting with its default, range and effect."""
-    table = Table("setting", "default", "allowed", "effect", box=box.SIMPLE_HEAD)
-    for row in describe():
-        table.add_row(*row)
+    """Every setting with its default, its effect and what it may be."""
+    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, pad_edge=False)
+    for name in ("setting", "default"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("effect (allowed values)")
+    for name, default, allowed, effect in describe():
+        shown = default if len(default) <= _DEFAULT_CHARS else f"{float(default):.4g}"
+        table.add_row(name, shown, f"{effect} ({allowed})" if allowed else effect)
     return table

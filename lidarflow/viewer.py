@@ -123,7 +123,7 @@ def open_in_viewer(rrd_path: Path) -> None:
     """Show a recording in the rerun viewer and wait until its window is closed."""
     if not Path(rrd_path).is_file():
         raise DataError(f"{rrd_path}: no such recording")
-    _require_display()
+    require_display(f"copy {rrd_path} to a desktop, or view it in a browser: rerun --web-viewer {rrd_path}")
     if subprocess.run([sys.executable, "-m", "rerun", str(rrd_path)], check=False).returncode != 0:
         raise InstallError(f"the rerun viewer failed; in a browser: rerun --web-viewer {rrd_path}")
 
@@ -232,18 +232,25 @@ def _thinned(mask: np.ndarray, limit: int) -> np.ndarray:
     return rows[:: max(1, -(-len(rows) // limit))]
 
 
-def _require_display() -> None:
+def require_live_view() -> None:
+    """Raise InstallError unless a viewer listens already or one can be opened here."""
+    if not _viewer_listens():
+        require_display()
+
+
+def require_display(instead: str = "") -> None:
+    """Raise InstallError where no window can be opened; `instead` is the command that needs none."""
     displays = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
     if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in displays):
-        raise InstallError("the rerun viewer needs a display and this session has none; "
-                           "copy the .rrd file to a desktop, or view it in a browser with rerun --web-viewer")
+        way_out = instead or "leave --visualize out and view the recording on a desktop"
+        raise InstallError(f"the rerun viewer needs a display and this session has none; {way_out}")
 
 
 def _start_viewer() -> None:
     """Start a viewer that outlives this process, unless one listens already; return when it is ready."""
     if _viewer_listens():
         return
-    _require_display()
+    require_display()
     viewer = subprocess.Popen([sys.executable, "-m", "rerun", "--port", str(_PORT), "--hide-welcome-screen"],
                               stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     deadline = time.monotonic() + _VIEWER_START_S

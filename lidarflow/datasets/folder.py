@@ -11,6 +11,7 @@ from lidarflow.errors import DataError
 from lidarflow.types import Truth
 
 INDEXED_POSE_FILES = ("ego_poses.txt", "derived_ego_icp.txt")
+_ODD_SIZE_RATIO = 2
 KITTI_FOLDERS = ("velodyne", "velodyne_points/data")
 
 
@@ -31,7 +32,7 @@ class CloudFolder(ScanFiles):
         times_ns, notes = _read_times(files[0].parent, files)
         self._poses, pose_notes = _read_poses(files[0].parent, files)
         super().__init__(folder_name(files[0].parent), files, times_ns, is_wanted(kitti_correction, is_kitti),
-                         [*notes, *pose_notes])
+                         [*notes, *pose_notes, *_odd_sizes(files)])
 
     def world_from_sensor(self) -> np.ndarray | None:
         """Given poses (N, 4, 4), where a file beside the scans holds them."""
@@ -83,6 +84,16 @@ def kitti_scan_folder(folder: Path) -> Path | None:
 def folder_name(folder: Path) -> str:
     """The name of a folder, also of "." and ".."."""
     return folder.resolve().name
+
+
+def _odd_sizes(files: list[Path]) -> list[str]:
+    """A note where the files are so different in size that they may be of several sensors."""
+    by_size = sorted(files, key=lambda file: file.stat().st_size)
+    smallest, largest = by_size[0], by_size[-1]
+    if largest.stat().st_size <= _ODD_SIZE_RATIO * smallest.stat().st_size:
+        return []
+    return [f"{largest.name} is more than {_ODD_SIZE_RATIO} times as large as {smallest.name}; "
+            "are all of them scans of one sensor?"]
 
 
 def _read_times(folder: Path, files: list[Path]) -> tuple[list[int] | None, list[str]]:
