@@ -29,7 +29,7 @@ class PreparationConfig:
     kitti_correction: str = setting(
         "auto", "raise KITTI points by the 0.205 deg that their calibration lacks; auto = for KITTI data",
         choices=("auto", "on", "off"))
-    min_range_m: float = setting(2.0, "nearer returns are the ego vehicle and are masked", low=0)
+    min_range_m: float = setting(1.5, "nearer returns are the ego vehicle and are masked", low=0)
     max_range_m: float = setting(80.0, "farther returns are masked", low=1)
 
 
@@ -107,7 +107,8 @@ class EgoConfig:
         "auto", "auto = KISS-ICP in a sequence, two-scan registration for a pair",
         choices=("auto", "registration", "kiss_icp"))
     refine: bool = setting(True, "register the two scans once more, from the KISS-ICP motion")
-    voxel_m: float = setting(0.2, "clouds are thinned to this before registration", low=0.02)
+    voxel_m: float = setting(
+        0.2, "clouds are thinned to this before registration, finer in small places", low=0.02)
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,8 +43,16 @@ def write_preview(path: Path, pair: ScanPair, result: FlowResult) -> None:
     residual_flow = result.residual_flow(points)
     colours = colour.scene_colours(points, residual_flow, result.is_dynamic, pair.dt_s)
     caption = f"{pair.source.name}: {int(result.is_dynamic.sum())} of {len(points)} points move over ground"
-    image = bird_eye(points, colours, result.is_dynamic, residual_flow, dt_s=pair.dt_s, caption=caption)
+    image = bird_eye(points, colours, result.is_dynamic, residual_flow, half_width_m=_half_width(points),
+                     dt_s=pair.dt_s, caption=caption)
     image.save(path, format="PNG")
+
+
+def _half_width(points: np.ndarray) -> float:
+    """Half of the picture's width in metres: most of the scan, at most 40 m."""
+    reach_m = np.hypot(points[:, 0], points[:, 1])
+    reach_m = reach_m[np.isfinite(reach_m)]
+    return float(np.clip(1.3 * np.quantile(reach_m, 0.95), 4.0, 40.0)) if len(reach_m) else 40.0
 
 
 def _to_pixel(points: np.ndarray, scale: float, size_px: int) -> np.ndarray:

@@ -7,12 +7,15 @@ from lidarflow.config import EgoConfig
 from lidarflow.errors import DataError
 from lidarflow.open3d_import import open3d
 
-# Coarse to fine: how far apart corresponding surfaces may be. The first stage reaches 4 m, the motion of a
-# 10 Hz sensor at 40 m/s.
-_STAGES_M = (4.0, 1.5, 0.6, 0.3, 0.15)
-_COARSE_VOXEL_M = 1.0
+# Coarse to fine: how far apart corresponding surfaces may be, in voxels. With voxels of 0.2 m the first stage
+# reaches 4 m, the motion of a 10 Hz sensor at 40 m/s, and the last 0.15 m.
+_STAGES_VOXELS = (20.0, 7.5, 3.0, 1.5, 0.75)
+_COARSE_VOXELS = 5.0         # the first stage works on a cloud thinned this much more
+_SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range: indoors all is smaller
+_NORMAL_RADIUS_VOXELS = 5.0
+_NORMAL_NEIGHBOURS = 40
 _MIN_POINTS = 30
-_NORMAL_RADIUS_SHARE = 5.0   # normals see five voxels around a point
+_MIN_OVERLAP = 0.3           # of the source within the third stage's reach of the target, at the end
 
 
 def register(
@@ -23,28 +26,35 @@ def register(
     Tukey's loss lets moving objects go. `start` is a first guess; without one the search begins wide, at
     the identity. Raises DataError when the clouds have too little in common.
     """
-    stages = _STAGES_M if start is None else _STAGES_M[1:]
-    target_from_source = np.eye(4) if start is None else start
-    clouds: dict[float, tuple] = {}
-    for reach_m in stages:
-        voxel_m = max(config.voxel_m, _COARSE_VOXEL_M) if reach_m == _STAGES_M[0] else config.voxel_m
-        if voxel_m not in clouds:
-            clouds[voxel_m] = _cloud(source, voxel_m, normals=False), _cloud(target, voxel_m, normals=True)
-        target_from_source = _icp(*clouds[voxel_m], reach_m, target_from_source)
-    if not pose.is_rigid(target_from_source, tolerance=1e-4):
-        raise DataError("ego-motion: registration found no rigid motion; are these two scans of one place?")
+    scene_m = float(np.median(np.linalg.norm(source, axis=1))) if len(source) else 0.0
+    voxel_m = min(config.voxel_m, _SCENE_VOXEL_SHARE * scene_m)
+    fine = _thinned(source, voxel_m), _with_normals(_thinned(target, voxel_m), voxel_m)
+    target_from_source = start
+    if start is None:
+        coarse_m = _COARSE_VOXELS * voxel_m
+        coarse = _thinned(source, coarse_m), _with_normals(_thinned(target, coarse_m), coarse_m)
+        target_from_source = _icp(*coarse, _STAGES_VOXELS[0] * voxel_m, np.eye(4))
+    for reach_voxels in _STAGES_VOXELS[1:]:
+        target_from_source = _icp(*fine, reach_voxels * voxel_m, target_from_source)
+    _require_overlap(*fine, _STAGES_VOXELS[2] * voxel_m, target_from_source)
     return target_from_source
 
 
-def _cloud(points: np.ndarray, voxel_m: float, normals: bool):
+def _thinned(points: np.ndarray, voxel_m: float):
     o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(voxel_m)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud = cloud.voxel_down_sample(voxel_m) if voxel_m > 0 else cloud
     if len(cloud.points) < _MIN_POINTS:
         raise DataError(
-            f"ego-motion: {len(cloud.points)} points are left of a scan after thinning to {voxel_m} m, "
-            f"at least {_MIN_POINTS} are needed; is the scan complete, in metres?")
-    if normals:
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(_NORMAL_RADIUS_SHARE * voxel_m, 40))
+            f"ego-motion: a scan has {len(points)} points in range, {len(cloud.points)} after thinning to "
+            f"{voxel_m:.2g} m, and registration needs {_MIN_POINTS}; is the scan complete and in metres, is "
+            "preparation.min_range_m too large for the place?")
+    return cloud
+
+
+def _with_normals(cloud, voxel_m: float):
+    search = open3d().geometry.KDTreeSearchParamHybrid(_NORMAL_RADIUS_VOXELS * voxel_m, _NORMAL_NEIGHBOURS)
+    cloud.estimate_normals(search)
     return cloud
 
 
@@ -54,6 +64,18 @@ def _icp(source, target, reach_m: float, start: np.ndarray) -> np.ndarray:
     criteria = registration.ICPConvergenceCriteria(1e-7, 1e-7, 50)
     found = registration.registration_icp(source, target, reach_m, start, method, criteria)
     return np.array(found.transformation)
+
+
+def _require_overlap(source, target, reach_m: float, target_from_source: np.ndarray) -> None:
+    """Raise DataError unless the motion is rigid and brings the clouds together."""
+    overlap = 0.0
+    if pose.is_rigid(target_from_source, tolerance=1e-4):
+        registration = open3d().pipelines.registration
+        overlap = registration.evaluate_registration(source, target, reach_m, target_from_source).fitness
+    if overlap < _MIN_OVERLAP:
+        raise DataError(
+            f"ego-motion: {overlap:.0%} of the first scan comes within {reach_m:.2g} m of the second, at "
+            f"least {_MIN_OVERLAP:.0%} should; are these consecutive scans of one sensor?")
 
 
 class Odometry:
