@@ -52,9 +52,11 @@ class NormalsConfig:
 class MeshConfig:
     method: str = setting("auto", "scan grid for spinning sensors, tangent planes for other clouds",
                           choices=("auto", "grid", "tangent"))
-    max_edge_m: float = setting(0.38, "longest edge where the scan is dense", low=0.01)
-    max_edge_deg: float = setting(
-        0.9, "longest edge, seen from the sensor, where rings are farther apart than max_edge_m", low=0)
+    max_edge_m: float = setting(
+        0.395, "longest edge: surfaces farther apart than this are never joined", low=0.01)
+    max_edge_rings: float = setting(
+        1.25, "longest edge in spacings of a spinning sensor's rings, where those are farther apart than "
+        "max_edge_m; 0 = max_edge_m everywhere", low=0)
     max_depth_jump_m: float = setting(0.36, "largest change of range along an edge", low=0.01)
     min_grazing_deg: float = setting(
         4.0, "an edge closer than this to the line of sight is a jump between surfaces", low=0, high=60)

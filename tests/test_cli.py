@@ -253,11 +253,11 @@ def test_a_run_may_start_later_and_end_earlier(lidarflow, scans, tmp_path):
 
 
 def test_settings_come_from_the_file_then_from_set(lidarflow, scans, tmp_path):
-    (tmp_path / "mine.toml").write_text("[mesh]\nmax_edge_m = 0.6\nmax_edge_deg = 1.5\n")
+    (tmp_path / "mine.toml").write_text("[mesh]\nmax_edge_m = 0.6\nmax_edge_rings = 1.5\n")
     lidarflow.ok("run", scans[0].parent.parent, "-n", 2, "--config", tmp_path / "mine.toml", "--set",
                  "mesh.max_edge_m=0.5", "--out", tmp_path / "out", "--no-record", "--dataloader", "kitti_raw")
     used = config.load(tmp_path / "out" / "config.toml")
-    assert (used.mesh.max_edge_m, used.mesh.max_edge_deg) == (0.5, 1.5)
+    assert (used.mesh.max_edge_m, used.mesh.max_edge_rings) == (0.5, 1.5)
 
 
 def test_scans_of_several_sensors_are_pointed_out(lidarflow, tmp_path):

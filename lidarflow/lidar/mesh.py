@@ -70,27 +70,38 @@ def _grid_triangles(
     """
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     rows = np.flatnonzero(kept & (ring >= 0))
-    triangles = _strips(points, azimuth, rows, ring, config)
+    limits = _limits(config, config.max_edge_rings * _ring_spacing(points, ring))
+    triangles = _strips(points, azimuth, rows, ring, limits)
     meshed = np.zeros(len(points), bool)
     meshed[triangles.ravel()] = True
-    triangles = np.concatenate([triangles, _strips(points, azimuth, rows[meshed[rows]], ring, config)])
+    triangles = np.concatenate([triangles, _strips(points, azimuth, rows[meshed[rows]], ring, limits)])
 
     component = components(unique_edges(triangles), len(points))
     is_fragment = np.bincount(component)[component] < _FRAGMENT_POINTS
     across = [
-        _strips(points, azimuth, rows[ring[rows] % step == phase], ring // step, config)
+        _strips(points, azimuth, rows[ring[rows] % step == phase], ring // step, limits)
         for step in (2, 3) for phase in range(step)
     ]
     across = np.concatenate(across)
     return np.concatenate([triangles, across[is_fragment[across].any(axis=1)]])
 
 
+def _ring_spacing(points: np.ndarray, ring: np.ndarray) -> float:
+    """Median angle in radians between a ring and the next."""
+    member = np.flatnonzero(ring >= 0)
+    member = member[np.argsort(ring[member], kind="stable")]
+    pitch = np.arctan2(points[member, 2], np.hypot(points[member, 0], points[member, 1]))
+    bounds = np.searchsorted(ring[member], np.arange(1, ring.max() + 1))
+    middle = [np.median(one_ring) for one_ring in np.split(pitch, bounds) if len(one_ring)]
+    return float(np.median(np.abs(np.diff(middle)))) if len(middle) > 1 else 0.0
+
+
 def _strips(
-    points: np.ndarray, azimuth: np.ndarray, rows: np.ndarray, ring: np.ndarray, config: MeshConfig
+    points: np.ndarray, azimuth: np.ndarray, rows: np.ndarray, ring: np.ndarray, limits: tuple
 ) -> np.ndarray:
     order = rows[np.lexsort((azimuth[rows], ring[rows]))]
     bounds = np.searchsorted(ring[order], np.arange(ring.max() + 2))
-    return kernel.ring_strips(points, azimuth, order, bounds, *_limits(config))
+    return kernel.ring_strips(points, azimuth, order, bounds, *limits)
 
 
 def _tangent_triangles(
@@ -101,13 +112,14 @@ def _tangent_triangles(
         return np.empty((0, 3), np.int32)
     point_normals = normals.estimate(points[rows], surface, normal_radius_m)
     local = kernel.tangent_stars(
-        points[rows], point_normals, *_limits(config), _MAX_SURFACE_ANGLE_RAD, _MIN_ANGLE_RAD, _MAX_ANGLE_RAD)
+        points[rows], point_normals, *_limits(config, max_edge_rad=0.0), _MAX_SURFACE_ANGLE_RAD,
+        _MIN_ANGLE_RAD, _MAX_ANGLE_RAD)
     return rows[local].astype(np.int32)
 
 
-def _limits(config: MeshConfig) -> tuple[float, float, float, float]:
-    return (config.max_edge_m, np.radians(config.max_edge_deg), config.max_depth_jump_m,
-            np.radians(config.min_grazing_deg))
+def _limits(config: MeshConfig, max_edge_rad: float) -> tuple[float, float, float, float]:
+    """What the kernels call continuous; edges may be longer than max_edge_m where max_edge_rad says so."""
+    return config.max_edge_m, max_edge_rad, config.max_depth_jump_m, np.radians(config.min_grazing_deg)
 
 
 def unique_edges(triangles: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ _MIN_POINTS_PER_RING = 50
 # Lasers sit apart from each other, so one ring's pitch, seen from the common origin, varies with range: by
 # 1.5 of 26 degrees on an HDL-64E.
 _MAX_RING_PITCH_SHARE = 0.1
+_MAX_SHARE_IN_WIDE_RINGS = 0.1   # of the points
 _MAX_STEP_RAD = np.radians(10.0)
 
 
@@ -38,8 +39,9 @@ def _from_file_order(azimuth: np.ndarray, pitch: np.ndarray) -> np.ndarray | Non
     direction = np.sign(np.median(step))
     if direction == 0 or (np.abs(step) < _MAX_STEP_RAD).mean() < 0.9:
         return None
-    turned = (direction * (azimuth - azimuth[0])) % (2 * np.pi)
-    starts = np.flatnonzero(np.diff(turned) < -np.pi) + 1
+    # Half a step before the first point, so that a ring that starts beside it starts behind the cut.
+    turned = (direction * (azimuth - azimuth[0]) + 0.5 * np.median(np.abs(step))) % (2 * np.pi)
+    starts = np.flatnonzero(np.diff(turned) < -_MAX_STEP_RAD) + 1   # a high ring may see one house, no cut
     ring = np.zeros(len(azimuth), np.int64)
     ring[starts] = 1
     ring = np.cumsum(ring)
@@ -75,7 +77,8 @@ def _checked(ring: np.ndarray, pitch: np.ndarray) -> np.ndarray | None:
     order = np.lexsort((pitch, np.where(member, ring, count)))[: member.sum()]
     bounds = np.searchsorted(ring[order], np.arange(count + 1))
     low, middle, high = (pitch[order][_rank(bounds, share)] for share in (0.1, 0.5, 0.9))
-    if np.median(high - low) > _MAX_RING_PITCH_SHARE * np.ptp(middle):
+    is_wide = high - low > _MAX_RING_PITCH_SHARE * np.ptp(middle)
+    if np.diff(bounds)[is_wide].sum() > _MAX_SHARE_IN_WIDE_RINGS * len(order):
         return None
     rank = np.empty(count, np.int32)
     rank[np.argsort(-middle, kind="stable")] = np.arange(count, dtype=np.int32)

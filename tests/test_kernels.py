@@ -1,0 +1,368 @@
+"""Compiled kernels against slow NumPy twins that share no code with them.
+
+Every check takes a size, so that the same comparison also runs with compilation off, on tiny inputs.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarflow.kernels import grid, linalg, matching, mesh, normals, shot
+
+RADIUS_M = 1.0
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def bumpy_surface(count: int, random: np.random.Generator) -> np.ndarray:
+    """Points (count, 3) on a patch of hills in front of the sensor, 40 per square metre."""
+    side = np.sqrt(count / 40.0)
+    u, v = random.uniform(-side / 2, side / 2, (2, count))
+    depth = 6.0 + 0.4 * np.sin(1.7 * u + 0.5) * np.cos(1.3 * v) + 0.15 * np.sin(4.1 * v + u)
+    return np.column_stack([depth, u, v]) + random.normal(scale=0.01, size=(count, 3))
+
+
+def random_rotation(random: np.random.Generator) -> np.ndarray:
+    q, r = np.linalg.qr(random.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+# ---- grid -----------------------------------------------------------------------------------------------
+
+def check_voxels(count: int) -> None:
+    points = rng(0).uniform(-3, 3, (count, 3))
+    points[: count // 10] = points[count // 10: 2 * (count // 10)]
+    nearest: dict[tuple, tuple[float, int]] = {}
+    for row, point in enumerate(points):
+        cell = np.floor(point / 0.7)
+        candidate = (((point / 0.7 - cell - 0.5) ** 2).sum(), row)
+        key = tuple(cell)
+        nearest[key] = min(candidate, nearest.get(key, (np.inf, -1)))
+    expected = sorted(row for _, row in nearest.values())
+    np.testing.assert_array_equal(grid.first_per_voxel(points, 0.7), expected)
+
+
+def check_grid_queries(count: int) -> None:
+    random = rng(1)
+    points = random.uniform(-2, 2, (count, 3))
+    queries = np.vstack([random.uniform(-3, 3, (count // 2, 3)), points[:5], [[50.0, 0, 0], [0, -50, 90]]])
+    order, keys, lower, shape = grid.build(points, 0.5)
+    assert (np.diff(keys) >= 0).all() and sorted(order) == list(range(count))
+    for query in queries:
+        starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
+        runs = grid.runs(query, keys, lower, shape, 0.5, starts, ends)
+        seen = [row for k in range(runs) for row in order[starts[k]:ends[k]]]
+        assert len(set(seen)) == len(seen)
+        within = np.flatnonzero(np.linalg.norm(points - query, axis=1) <= 0.5)
+        assert set(within) <= set(seen)
+
+
+# ---- linear algebra -------------------------------------------------------------------------------------
+
+def symmetric_matrices(count: int) -> list[np.ndarray]:
+    random = rng(2)
+    matrices = [m + m.T for m in random.normal(size=(count, 3, 3))]
+    matrices += [np.outer(v, v) for v in random.normal(size=(count, 3))]
+    for values in ([1, 1, 2], [0, 3, 3], [5, 5, 5], [-1, 0, 1], [1e-9, 1e-9, 1], [1e-6, 1, 1e6]):
+        q = random_rotation(random)
+        turned = q @ np.diag(np.array(values, float)) @ q.T
+        matrices.append((turned + turned.T) / 2)
+    exchange = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 0]])
+    return matrices + [np.zeros((3, 3)), np.eye(3), np.diag([3.0, 1.0, 2.0]), exchange, 1e-12 * matrices[0]]
+
+
+def check_eigen(count: int) -> None:
+    for m in symmetric_matrices(count):
+        values, vectors = np.empty(3), np.empty((3, 3))
+        linalg.symmetric_eigen3(m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2], values, vectors)
+        size = np.abs(m).max() + 1e-300
+        np.testing.assert_allclose(values / size, np.linalg.eigh(m)[0] / size, atol=1e-12)
+        np.testing.assert_allclose(vectors.T @ vectors, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose((vectors * values) @ vectors.T / size, m / size, atol=1e-12)
+
+
+# ---- normals --------------------------------------------------------------------------------------------
+
+def normals_twin(points: np.ndarray, surface: np.ndarray, radius_m: float) -> np.ndarray:
+    found = np.full(points.shape, np.nan)
+    for row, point in enumerate(points):
+        near = surface[np.linalg.norm(surface - point, axis=1) <= radius_m]
+        if len(near) < 4:
+            continue
+        values, vectors = np.linalg.eigh(np.cov(near.T, bias=True))
+        if values[1] <= 1e-3 * values[2]:
+            continue
+        found[row] = vectors[:, 0] * (-1.0 if vectors[:, 0] @ point > 0 else 1.0)
+    return found
+
+
+def check_normals(count: int) -> None:
+    random = rng(3)
+    surface = bumpy_surface(count, random)
+    lone = np.array([[20.0, 0, 0], [20.1, 0, 0], [20.2, 0, 0]])
+    line = np.column_stack([np.linspace(30, 31, 12), np.linspace(1, 2, 12), np.zeros(12)])
+    surface = np.vstack([surface, lone, line])
+    points = np.vstack([surface[:: max(1, count // 60)], lone, line[:5], surface[:5] + 0.1, [[99.0, 99, 99]]])
+    estimated, expected = normals.estimate(points, surface, 0.5), normals_twin(points, surface, 0.5)
+    np.testing.assert_array_equal(np.isnan(estimated), np.isnan(expected))
+    assert np.isnan(expected).any() and np.isfinite(expected).all(axis=1).sum() >= 10
+    np.testing.assert_allclose(estimated, expected, atol=1e-8)
+
+
+# ---- SHOT -----------------------------------------------------------------------------------------------
+
+def shot_frame_twin(offsets: np.ndarray, radius_m: float) -> tuple[np.ndarray, bool]:
+    """Frame (3, 3), rows x y z, and whether the signs of its axes are beyond doubt (equations 1-3)."""
+    distance = np.linalg.norm(offsets, axis=1)
+    weight = radius_m - distance
+    covariance = (weight[:, None] * offsets).T @ offsets / weight.sum()
+    _, vectors = np.linalg.eigh(covariance)
+    is_certain, axes = True, {}
+    for name, column in (("x", 2), ("z", 0)):
+        axis = vectors[:, column]
+        ahead = (offsets @ axis >= 0).sum()
+        is_certain &= 2 * ahead != len(offsets)
+        axes[name] = axis if 2 * ahead >= len(offsets) else -axis
+    return np.stack([axes["x"], np.cross(axes["z"], axes["x"]), axes["z"]]), bool(is_certain)
+
+
+def pcl_sector(x: float, y: float) -> int:
+    """Azimuth sector by the sign tests of PCL's shot.hpp."""
+    bit4 = int(y > 0 or (y == 0 and x < 0))
+    bit3 = (1 - bit4) if (x > 0 or (x == 0 and y > 0)) else bit4
+    bit2 = not abs(x) >= abs(y) if x * y > 0 or x == 0 else abs(x) > abs(y)
+    return 4 * bit4 + 2 * bit3 + int(bit2)
+
+
+def shot_vote_twin(histogram: np.ndarray, local: np.ndarray, cosine: float, radius_m: float) -> None:
+    """One neighbour's votes in a histogram (8, 2, 2, 11) of azimuth, shell, elevation and cosine.
+
+    Along each of the four axes, one unit is split between the bin the neighbour is in and the next one
+    along that axis, by how far it is from their centres; what would leave the support is lost.
+    """
+    x, y, z = local
+    distance = np.linalg.norm(local)
+    azimuth, polar = np.arctan2(y, x), np.arctan2(np.hypot(x, y), z)
+    place = np.array([
+        (azimuth + np.pi) / (np.pi / 4) - 0.5, distance / (radius_m / 2) - 0.5,
+        1.5 - polar / (np.pi / 2), (1 + cosine) / 2 * 10])
+    own = np.array([pcl_sector(x, y), distance > radius_m / 2, z > 0, np.floor(place[3] + 0.5)], int)
+    for axis, size in enumerate(histogram.shape):
+        beside = place[axis] - own[axis]
+        histogram[tuple(own)] += 1 - abs(beside)
+        neighbour = own.copy()
+        neighbour[axis] += 1 if beside > 0 else -1
+        if axis == 0:
+            neighbour[axis] %= size
+        if 0 <= neighbour[axis] < size:
+            histogram[tuple(neighbour)] += abs(beside)
+
+
+def shot_twin(keypoint, surface, surface_normals, radius_m):
+    offsets = surface - keypoint
+    distance = np.linalg.norm(offsets, axis=1)
+    near = (distance > 0) & (distance <= radius_m)
+    frame, is_certain = shot_frame_twin(offsets[near], radius_m)
+    histogram = np.zeros((8, 2, 2, 11))
+    for offset, normal in zip(offsets[near], surface_normals[near], strict=True):
+        if np.isfinite(normal).all():
+            shot_vote_twin(histogram, frame @ offset, float(np.clip(frame[2] @ normal, -1, 1)), radius_m)
+    return histogram.ravel() / np.linalg.norm(histogram), frame, is_certain
+
+
+def described_surface(count: int, keypoints: int):
+    surface = bumpy_surface(count, rng(4))
+    surface_normals = normals_twin(surface, surface, 0.5)
+    surface_normals[::17] = np.nan
+    inner = np.flatnonzero(np.abs(surface[:, 1:]).max(axis=1) < np.abs(surface[:, 1:]).max() * 0.8)
+    chosen = surface[inner[np.linspace(0, len(inner) - 1, keypoints).astype(int)]]
+    chosen[1::2] += rng(5).normal(scale=0.03, size=chosen[1::2].shape)
+    return chosen, surface, surface_normals
+
+
+def check_shot(count: int, keypoints: int) -> None:
+    chosen, surface, surface_normals = described_surface(count, keypoints)
+    descriptors, frames = shot.describe(chosen, surface, surface_normals, RADIUS_M, 5)
+    compared = 0
+    for row, keypoint in enumerate(chosen):
+        expected, frame, is_certain = shot_twin(keypoint, surface, surface_normals, RADIUS_M)
+        if is_certain:
+            compared += 1
+            np.testing.assert_allclose(frames[row], frame, atol=1e-7)
+            np.testing.assert_allclose(descriptors[row], expected, atol=2e-5)
+    assert compared >= 0.8 * keypoints
+
+
+# ---- matching -------------------------------------------------------------------------------------------
+
+def matching_twin(centres, descriptors, candidates, candidate_descriptors, gate_m, rival_radius_m):
+    best = np.full(len(centres), -1)
+    best_sq, rival_sq = np.full(len(centres), np.inf), np.full(len(centres), np.inf)
+    for i, centre in enumerate(centres):
+        inside = np.flatnonzero(np.linalg.norm(candidates - centre, axis=1) <= gate_m)
+        if len(inside) == 0:
+            continue
+        apart_sq = ((candidate_descriptors[inside].astype(float) - descriptors[i]) ** 2).sum(axis=1)
+        best[i], best_sq[i] = inside[apart_sq.argmin()], apart_sq.min()
+        away = np.linalg.norm(candidates[inside] - candidates[best[i]], axis=1) > rival_radius_m
+        rival_sq[i] = apart_sq[away].min(initial=np.inf)
+    return best, best_sq, rival_sq
+
+
+def check_matching(count: int) -> None:
+    random = rng(6)
+    candidates, centres = random.uniform(-2, 2, (count, 3)), random.uniform(-3, 3, (count // 2, 3))
+    centres[0] = (40.0, 0, 0)
+    unit = [d / np.linalg.norm(d, axis=1, keepdims=True) for d in random.uniform(size=(2, count, 20))]
+    unit = [d.astype(np.float32) for d in unit]
+    given = (centres, unit[0][: len(centres)], candidates, unit[1], 1.1, 0.6)
+    found, expected = matching.best_in_gate(*given), matching_twin(*given)
+    assert (expected[0] == -1).any() and (expected[0] >= 0).any() and np.isfinite(expected[2]).any()
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-5)
+    np.testing.assert_allclose(found[2], expected[2], atol=1e-5)
+    nothing = matching.best_in_gate(centres, given[1], candidates[:0], unit[1][:0], 1.1, 0.6)
+    assert (nothing[0] == -1).all() and np.isinf(nothing[1]).all() and np.isinf(nothing[2]).all()
+
+
+# ---- mesh -----------------------------------------------------------------------------------------------
+
+def check_ring_strips(rings: int, columns: int) -> None:
+    """A band of a cylinder: all of its strips, nothing else; also where azimuth wraps around."""
+    limits = (0.9, 0.0, 1.0, np.radians(4.0))
+    azimuth = (np.arange(columns) + 0.3) * (2 * np.pi / columns) - np.pi
+    angle, level = np.tile(azimuth, rings), np.repeat(np.arange(rings), columns)
+    points = np.column_stack([5 * np.cos(angle), 5 * np.sin(angle), 0.5 * level])
+    order, bounds = np.arange(len(points)), np.arange(rings + 1) * columns
+    assert 5 * 2 * np.pi / columns < 0.7, "columns must be close enough to be joined"
+    around = mesh.ring_strips(points, angle, order, bounds, *limits)
+    assert len(around) == 2 * (rings - 1) * columns
+    assert len(np.unique(np.sort(around, axis=1), axis=0)) == len(around)
+    assert (np.ptp(level[around], axis=1) == 1).all()
+    column_steps = (around % columns - around[:, :1] % columns + 1) % columns
+    assert (column_steps <= 2).all()
+
+    gap = (angle > 0.5) & (angle < 1.5)
+    rows = np.flatnonzero(~gap)
+    bounds = np.searchsorted(level[rows], np.arange(rings + 1))
+    opened = mesh.ring_strips(points, angle, rows, bounds, *limits)
+    assert not gap[opened].any()
+    missing = 2 * (rings - 1) * (gap.sum() // rings + 1)
+    assert len(opened) == len(around) - missing
+    for i, j in ((0, 1), (1, 2), (0, 2)):
+        assert np.linalg.norm(points[opened[:, i]] - points[opened[:, j]], axis=1).max() <= 0.9
+
+
+def check_tangent_stars(count: int) -> None:
+    points = bumpy_surface(count, rng(7))
+    surface_normals = normals_twin(points, points, 0.5)
+    limits = (0.4, 0.0, 0.36, np.radians(4.0), np.radians(45), np.radians(2), np.radians(120))
+    triangles = mesh.tangent_stars(points, surface_normals, *limits)
+    assert (triangles[:, 0] < triangles[:, 1]).all() and (triangles[:, 1] < triangles[:, 2]).all()
+    assert len(np.unique(triangles, axis=0)) == len(triangles)
+    corners = points[triangles]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    assert sides.max() <= 0.4
+    assert 1.2 * count < len(triangles) < 2.0 * count
+
+
+def check_all_tiny() -> None:
+    """Every comparison on tiny inputs, for interpreted kernels."""
+    check_voxels(60)
+    check_grid_queries(40)
+    check_eigen(2)
+    check_normals(120)
+    check_shot(160, 4)
+    check_matching(40)
+    check_ring_strips(3, 60)
+    check_tangent_stars(150)
+
+
+def test_first_per_voxel():
+    check_voxels(2000)
+    assert len(grid.first_per_voxel(np.empty((0, 3)), 0.1)) == 0
+
+
+def test_grid_queries_see_every_neighbour_once():
+    check_grid_queries(400)
+
+
+def test_symmetric_eigen3():
+    check_eigen(60)
+
+
+def test_normals():
+    check_normals(1500)
+
+
+def test_normals_without_any_surface_are_nan():
+    assert np.isnan(normals.estimate(np.ones((3, 3)), np.empty((0, 3)), 0.5)).all()
+
+
+def test_shot():
+    check_shot(1500, 40)
+
+
+def test_shot_has_unit_norm_or_is_nan():
+    chosen, surface, surface_normals = described_surface(1500, 20)
+    far = np.vstack([chosen, [[40.0, 0, 0]], surface[:1] + [0, 50, 0]])
+    descriptors, frames = shot.describe(far, surface, surface_normals, RADIUS_M, 10)
+    assert descriptors.dtype == np.float32 and descriptors.shape == (22, 352)
+    np.testing.assert_allclose(np.linalg.norm(descriptors[:20], axis=1), 1.0, atol=1e-5)
+    assert np.isnan(descriptors[20:]).all() and np.isnan(frames[20:]).all()
+    np.testing.assert_allclose(frames[:20] @ np.swapaxes(frames[:20], 1, 2), np.tile(np.eye(3), (20, 1, 1)),
+                               atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(frames[:20]), 1.0)
+    counts = (np.linalg.norm(surface - chosen[:, None], axis=2) <= RADIUS_M).sum(axis=1)
+    nothing, _ = shot.describe(chosen, surface, surface_normals, RADIUS_M, int(counts.max()) + 1)
+    assert np.isnan(nothing).all()
+
+
+def test_shot_turns_with_the_cloud():
+    chosen, surface, surface_normals = described_surface(1500, 40)
+    rotation, shift = random_rotation(rng(8)), np.array([3.0, -7.0, 1.0])
+    there, frames = shot.describe(chosen, surface, surface_normals, RADIUS_M, 10)
+    turned, turned_frames = shot.describe(
+        chosen @ rotation.T + shift, surface @ rotation.T + shift, surface_normals @ rotation.T, RADIUS_M, 10)
+    cosine = (there.astype(float) * turned).sum(axis=1)
+    assert cosine.min() >= 0.999
+    np.testing.assert_allclose(turned_frames, frames @ rotation.T, atol=1e-6)
+
+
+def test_best_in_gate():
+    check_matching(400)
+
+
+def test_ring_strips():
+    check_ring_strips(6, 90)
+
+
+def test_tangent_stars():
+    check_tangent_stars(1200)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_kernels_leave_their_arguments_alone(seed):
+    points = bumpy_surface(300, rng(seed))
+    before = points.copy()
+    own = normals.estimate(points, points, 0.5)
+    own_before = own.copy()
+    shot.describe(points[:10], points, own, RADIUS_M, 10)
+    grid.first_per_voxel(points, 0.3)
+    np.testing.assert_array_equal(points, before)
+    np.testing.assert_array_equal(own, own_before)
+
+
+def test_kernels_are_plain_python_underneath():
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import test_kernels; test_kernels.check_all_tiny()"],
+        cwd=Path(__file__).parent, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
