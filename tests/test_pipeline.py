@@ -272,7 +272,7 @@ def test_a_bare_wall_stays_on_its_plane():
 
 
 @pytest.mark.parametrize(("source_rows", "target_rows", "text"), [
-    (10, 10, "registration needs 30"), (4000, 10, "10 points are left"), (10, 4000, "10 points are left"),
+    (10, 10, "registration needs 30"), (4000, 10, "registration needs 30"), (10, 4000, "registration needs 30"),
     (0, 4000, "none of 0 points"), (4000, 0, "none of 0 points")])
 def test_too_few_points_are_one_clear_line(source_rows, target_rows, text):
     pair = worlds.plane_pair(rng(6))
