@@ -64,8 +64,8 @@ class MeshConfig:
 
 @dataclass(frozen=True, slots=True)
 class ShotConfig:
-    radius_m: float = setting(1.6, "radius of the neighbourhood that a descriptor sees", low=0.05)
-    surface_voxel_m: float = setting(0.1, "the surface is thinned to one point per voxel; 0 = all", low=0)
+    radius_m: float = setting(1.4, "radius of the neighbourhood that a descriptor sees", low=0.05)
+    surface_voxel_m: float = setting(0.12, "the surface is thinned to one point per voxel; 0 = all", low=0)
     min_neighbours: int = setting(10, "points with fewer neighbours get no descriptor", low=5)
 
 
