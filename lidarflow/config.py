@@ -99,6 +99,10 @@ class SolverConfig:
         choices=("point", "sensor"))
     data_weight: float = setting(1.0, "weight of a squared match residual in m²", low=1e-6)
     smoothness_weight: float = setting(10.0, "weight of a squared twist between neighbours", low=1e-6)
+    tie_weight: float = setting(
+        100.0, "weight of a squared twist between a point and its object's, or the world's, motion", low=1e-6)
+    tie_truncation: float = setting(
+        0.15, "such a twist (metres and radians) beyond this lets the point go", low=1e-3)
     max_iterations: int = setting(50, "Levenberg-Marquardt iterations per step and component", low=1)
     relative_tolerance: float = setting(1e-4, "stop when an iteration gains less than this share", low=0)
 
@@ -123,6 +127,21 @@ class DynamicConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ObjectsConfig:
+    enabled: bool = setting(True, "look for moving objects; the rest of the world follows the ego-motion")
+    near_m: float = setting(0.06, "a point this near to the next scan is explained", low=1e-3)
+    near_share: float = setting(0.006, "and this share of its range more", low=0)
+    min_points: int = setting(8, "smaller objects are not looked for", low=4)
+    min_speed_m_per_s: float = setting(0.5, "slower objects count as static", low=0)
+    min_matches: int = setting(3, "descriptor matches that must follow an object's motion", low=0)
+    min_unexplained: float = setting(
+        0.1, "share of an object's points that ego-motion must leave unexplained", low=0, high=1)
+    max_misfit_ratio: float = setting(
+        0.35, "an object's own motion must bring its mean squared misfits, that of shape times that of "
+        "matches, down to this share", low=0, high=1)
+
+
+@dataclass(frozen=True, slots=True)
 class CrispnessConfig:
     sigma_m: float = setting(0.2, "σ of eq. 15: how far off still counts as aligned", low=1e-3)
 
@@ -141,6 +160,7 @@ class Config:
     solver: SolverConfig = field(default_factory=SolverConfig)
     ego: EgoConfig = field(default_factory=EgoConfig)
     dynamic: DynamicConfig = field(default_factory=DynamicConfig)
+    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     crispness: CrispnessConfig = field(default_factory=CrispnessConfig)
 
 

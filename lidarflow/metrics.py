@@ -25,7 +25,7 @@ def crispness(points: np.ndarray, target: np.ndarray, sigma_m: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Crispness of the graph's points before any motion, after ego-motion, and after their own flow."""
+    """Crispness before any motion, after ego-motion, and after the points' own flow."""
 
     before: float
     by_ego: float
@@ -34,8 +34,8 @@ class Alignment:
 
 
 def alignment(source: Scan, target: Scan, result: FlowResult, sigma_m: float) -> Alignment:
-    """Crispness of the solved points of the graph, the ones whose flow is the graph's own."""
-    rows = result.in_graph & result.valid
+    """Crispness of the points above ground whose motion is known."""
+    rows = result.valid & ~result.is_ground
     points = source.points[rows]
     return Alignment(
         before=crispness(points, target.points, sigma_m),

@@ -11,9 +11,9 @@ from lidarflow import pose
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.errors import DataError
-from lidarflow.lidar import dynamic, ego, features, frontend, mesh, preparation, start
+from lidarflow.lidar import dynamic, ego, features, frontend, mesh, objects, preparation, start
 from lidarflow.solve import gtsam_lm
-from lidarflow.types import FlowResult, Scan, ScanPair
+from lidarflow.types import FlowResult, MovingObject, Scan, ScanPair
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,23 +101,77 @@ def _estimate(
     with timed("matching"):
         start_motions = _start(points, previous, ego_motion, config)
         graph = frontend.build_problem(pair, source, target, surface_mesh, start_motions, config)
+        matches = graph.problem.points[graph.problem.match_index], graph.problem.match_target
+    with timed("objects"):
+        on_objects = _OnObjects.none(points)
+        if config.objects.enabled:
+            on_objects = _find_objects(pair, source, target, graph, ego_motion, config)
+            graph = frontend.focused(graph, on_objects.object_id, on_objects.motions, ego_motion)
     with timed("solver"):
         motions, solved, stats = gtsam_lm.solve(graph.problem, config.solver, config.graph.min_matches)
     with timed("dense answer"):
         in_graph = graph.variable >= 0
+        is_solved = np.zeros(len(points), bool)
+        is_solved[in_graph] = solved[graph.variable[in_graph]]
+        on_object = on_objects.object_id >= 0
         dense = np.tile(ego_motion, (len(points), 1, 1))
+        dense[on_object] = on_objects.motions[on_objects.object_id[on_object]]
         dense[in_graph] = motions[graph.variable[in_graph]]
-        valid = source.ground.copy()
-        valid[in_graph] = solved[graph.variable[in_graph]]
         flow = pose.apply(dense, points) - points
-        residual_flow = flow - (pose.apply(ego_motion, points) - points)
-        is_dynamic = dynamic.detect(
-            points, residual_flow, in_graph & valid, surface_mesh.edges, ego_motion,
-            pair.target.points[target.usable], pair.dt_s, config.dynamic)
-    problem = graph.problem
+        is_dynamic = on_object
+        if not config.objects.enabled:
+            residual_flow = flow - (pose.apply(ego_motion, points) - points)
+            is_dynamic = dynamic.detect(
+                points, residual_flow, is_solved, surface_mesh.edges, ego_motion,
+                pair.target.points[target.usable], pair.dt_s, config.dynamic)
+    valid = source.ground | on_objects.explained | is_solved
     return FlowResult(
-        flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds,
-        problem.points[problem.match_index], problem.match_target), target
+        flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,
+        on_objects.object_id, on_objects.objects), target
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _OnObjects:
+    """Which points move with which object, and which the objects or the ego-motion explain."""
+
+    object_id: np.ndarray
+    motions: np.ndarray
+    explained: np.ndarray
+    objects: tuple[MovingObject, ...]
+
+    @classmethod
+    def none(cls, points: np.ndarray) -> "_OnObjects":
+        n = len(points)
+        return cls(np.full(n, -1, np.int32), np.empty((0, 4, 4)), np.zeros(n, bool), ())
+
+
+def _find_objects(
+    pair: ScanPair, source: features.Features, target: features.Features, graph: frontend.Graph,
+    ego_motion: np.ndarray, config: Config,
+) -> _OnObjects:
+    """The moving objects among the source's non-ground points."""
+    points = pair.source.points
+    rows = np.flatnonzero(source.usable & ~source.ground)
+    at = np.full(len(points), -1)
+    at[rows] = np.arange(len(rows))
+    matched = at[graph.rows[graph.problem.match_index]]
+    view = objects.look(
+        pose.apply(ego_motion, points[rows]), pair.target.points[target.usable],
+        target.ground[target.usable], pose.apply(ego_motion, points[source.usable]),
+        (matched, graph.problem.match_target), config.objects)
+    bodies = objects.find(view, pair.dt_s, config.objects)
+
+    object_id = np.full(len(points), -1, np.int32)
+    explained = np.zeros(len(points), bool)
+    explained[rows] = ~(view.evidence.unexplained | view.evidence.blind)
+    for number, body in enumerate(bodies):
+        object_id[rows[body.rows]] = number
+        explained[rows[body.rows]] = True
+    motions = [body.over_ground @ ego_motion for body in bodies]
+    described = tuple(
+        objects.describe(number, points[rows[body.rows]], motion, ego_motion, pair.dt_s)
+        for number, (body, motion) in enumerate(zip(bodies, motions, strict=True)))
+    return _OnObjects(object_id, np.array(motions).reshape(-1, 4, 4), explained, described)
 
 
 def _require_points(scan: Scan, config: Config) -> None:

@@ -102,6 +102,8 @@ class FlowProblem:
     match_target   (K, 3) float64      the matched position p', metres, target frame
     edges          (E, 2) int32        mesh neighbours, i < j, unique
     component      (M,) int32          mesh component of each variable, 0 .. C-1
+    group          (M,) int32          group whose motion ties a variable, -1 = free; empty = all free
+    group_motions  (G, 4, 4) float64   motion of each group (the ego-motion, an object's), target_from_source
     """
 
     points: np.ndarray
@@ -110,6 +112,8 @@ class FlowProblem:
     match_target: np.ndarray
     edges: np.ndarray
     component: np.ndarray
+    group: np.ndarray = field(default_factory=lambda: np.empty(0, np.int32))
+    group_motions: np.ndarray = field(default_factory=lambda: np.empty((0, 4, 4)))
 
     def __post_init__(self):
         _check("FlowProblem.points", self.points, (None, 3), "f")
@@ -119,6 +123,10 @@ class FlowProblem:
         _check("FlowProblem.match_target", self.match_target, (len(self.match_index), 3), "f")
         _check("FlowProblem.edges", self.edges, (None, 2), "i")
         _check("FlowProblem.component", self.component, (m,), "i")
+        _check("FlowProblem.group", self.group, (m if len(self.group) else 0,), "i")
+        _check("FlowProblem.group_motions", self.group_motions, (None, 4, 4), "f")
+        if self.group.size and self.group.max() >= len(self.group_motions):
+            raise ValueError(f"FlowProblem.group: there are {len(self.group_motions)} group motions")
         for name, index in (("match_index", self.match_index), ("edges", self.edges)):
             if index.size and (index.min() < 0 or index.max() >= m):
                 raise ValueError(f"FlowProblem.{name}: indices must lie in 0..{m - 1}")
@@ -153,6 +161,33 @@ class SolveStats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MovingObject:
+    """Neighbouring points with one rigid motion of their own.
+
+    id               int             its number in FlowResult.object_id
+    motion           (4, 4) float64  target_from_source, total
+    velocity         (3,) float64    m/s over ground, in the axes of the target's frame
+    box_centre       (3,) float64    metres, source frame
+    box_size         (3,) float64    length along the motion, width, height, metres
+    box_yaw          float           direction of the length, radians about z
+    points           int             how many points of the source are on it
+    """
+
+    id: int
+    motion: np.ndarray
+    velocity: np.ndarray
+    box_centre: np.ndarray
+    box_size: np.ndarray
+    box_yaw: float
+    points: int
+
+    def __post_init__(self):
+        _check_motion("MovingObject.motion", self.motion)
+        for name in ("velocity", "box_centre", "box_size"):
+            _check(f"MovingObject.{name}", getattr(self, name), (3,), "f")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FlowResult:
     """The answer for one pair, rows aligned with the source scan.
 
@@ -166,6 +201,9 @@ class FlowResult:
     seconds      dict                wall time of each stage
     match_source (K, 3) float64      matched points, metres, source frame
     match_target (K, 3) float64      where their matches are, metres, target frame
+    is_ground    (N,) bool           ground of the static world; none when not given
+    object_id    (N,) int32          the moving object the point is on, -1 = none (the default)
+    objects      tuple               the moving objects, ids 0, 1, …
     """
 
     flow: np.ndarray
@@ -178,13 +216,21 @@ class FlowResult:
     seconds: dict[str, float] = field(default_factory=dict)
     match_source: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     match_target: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    is_ground: np.ndarray | None = None
+    object_id: np.ndarray | None = None
+    objects: tuple[MovingObject, ...] = ()
 
     def __post_init__(self):
         _check("FlowResult.flow", self.flow, (None, 3), "f")
         n = len(self.flow)
+        if self.is_ground is None:
+            object.__setattr__(self, "is_ground", np.zeros(n, bool))
+        if self.object_id is None:
+            object.__setattr__(self, "object_id", np.full(n, -1, np.int32))
         _check("FlowResult.motions", self.motions, (n, 4, 4), "f")
-        for name in ("valid", "in_graph", "is_dynamic"):
+        for name in ("valid", "in_graph", "is_ground", "is_dynamic"):
             _check(f"FlowResult.{name}", getattr(self, name), (n,), "b")
+        _check("FlowResult.object_id", self.object_id, (n,), "i")
         _check("FlowResult.match_source", self.match_source, (None, 3), "f")
         _check("FlowResult.match_target", self.match_target, (len(self.match_source), 3), "f")
         _check_motion("FlowResult.ego_motion", self.ego_motion)

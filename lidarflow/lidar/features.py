@@ -14,7 +14,7 @@ from lidarflow.types import Scan
 class Features:
     """A prepared scan.
 
-    usable       (N,) bool          finite and within the range limits
+    usable       (N,) bool          finite, within the range limits, no reflection from under the road
     ground       (N,) bool          the ground among them
     surface      (S, 3) float64     thinned non-ground points, metres
     keypoint     (K,) int64         rows of the scan
@@ -32,6 +32,7 @@ def extract(scan: Scan, config: Config) -> Features:
     """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid and their descriptors."""
     usable = preparation.usable(scan.points, config.preparation)
     on_ground = ground.detect(scan.points, usable, config.ground)
+    usable &= ~ground.reflections(scan.points, usable, on_ground)
     rows = np.flatnonzero(usable & ~on_ground)
     surface = _thinned(scan.points[rows], config.shot.surface_voxel_m)
     keypoint = rows[grid.first_per_voxel(scan.points[rows], config.matching.keypoint_voxel_m)]

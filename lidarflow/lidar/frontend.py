@@ -18,10 +18,12 @@ class Graph:
 
     problem   FlowProblem
     variable  (N,) int32    variable whose motion a point of the source has, -1 = outside the graph
+    rows      (M,) int64    row of the source that each variable sits at
     """
 
     problem: FlowProblem
     variable: np.ndarray
+    rows: np.ndarray
 
 
 def build_problem(
@@ -52,7 +54,42 @@ def build_problem(
         edges=edges,
         component=component.astype(np.int32),
     )
-    return Graph(problem, variable)
+    return Graph(problem, variable, rows)
+
+
+def focused(
+    graph: Graph, object_id: np.ndarray, object_motions: np.ndarray, ego_motion: np.ndarray
+) -> Graph:
+    """The part of a graph that moving objects touch, every variable tied to its object or the world.
+
+    object_id (N,), -1 = none; object_motions (G, 4, 4) and ego_motion (4, 4), target_from_source. Mesh
+    components without a point on an object follow the ego-motion: ego-motion explains them.
+    """
+    problem = graph.problem
+    rows = np.flatnonzero(graph.variable >= 0)
+    owner = np.full(len(problem.points), -1)
+    on_object = rows[object_id[rows] >= 0]
+    owner[graph.variable[on_object]] = object_id[on_object]
+    kept = np.isin(problem.component, problem.component[owner >= 0])
+    position = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
+
+    match_kept = kept[problem.match_index]
+    motions = np.concatenate([ego_motion[None], object_motions])
+    group = (owner[kept] + 1).astype(np.int32)   # group 0 is the static world
+    _, component = np.unique(problem.component[kept], return_inverse=True)
+    reduced = FlowProblem(
+        points=problem.points[kept],
+        initial=motions[group],
+        match_index=position[problem.match_index[match_kept]],
+        match_target=problem.match_target[match_kept],
+        edges=position[problem.edges[kept[problem.edges[:, 0]]]],
+        component=component.astype(np.int32),
+        group=group,
+        group_motions=motions,
+    )
+    variable = np.full(len(graph.variable), -1, np.int32)
+    variable[rows] = position[graph.variable[rows]]
+    return Graph(reduced, variable, graph.rows[kept])
 
 
 def _variables(points: np.ndarray, mesh: Mesh, thinning_m: float) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,8 @@ _NEAR_M = 20.0
 _MIN_CELL_POINTS = 5
 _MIN_CLOUD_POINTS = 50
 _PATCHWORK_MIN_RANGE_M = 1.0
+_LOW_SHARE = 0.1
+_REFLECTION_DEPTH_M = 0.5
 _FILL_NEIGHBOURS = 8
 _FILL_RADIUS_M = 2.0
 
@@ -47,11 +49,34 @@ def estimate_sensor_height(points: np.ndarray) -> float | None:
     return float(-np.quantile(trusted, 0.25)) if len(trusted) else None
 
 
+def reflections(points: np.ndarray, kept: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """Mask (N,) of the `kept` points that lie clearly below the ground around them.
+
+    No surface is there: the beam was mirrored by a car or a window, and the point moves with the mirror.
+    """
+    below = np.zeros(len(points), bool)
+    if not ground.any():
+        return below
+    surface = points[ground]
+    low = np.flatnonzero(kept & ~ground)
+    low = low[points[low, 2] < np.median(surface[:, 2]) - _REFLECTION_DEPTH_M]
+    if len(low):
+        _, nearest = cKDTree(surface[:, :2]).query(points[low, :2], workers=-1)
+        below[low] = points[low, 2] < surface[nearest, 2] - _REFLECTION_DEPTH_M
+    return below
+
+
 def _close_to_local_ground(points: np.ndarray, max_height_m: float) -> np.ndarray:
-    """Mask (N,) of the points at most `max_height_m` over the lowest ground of their cell."""
-    lowest, _, cell = _lowest_per_cell(points)
+    """Mask (N,) of the points at most `max_height_m` over the low ground of their cell.
+
+    A low quantile, not the lowest point, which may be a reflection from under the road.
+    """
+    _, counts, cell = _lowest_per_cell(points)
+    order = np.lexsort((points[:, 2], cell))
+    first = np.cumsum(counts) - counts
+    low = points[order[first + (_LOW_SHARE * (counts - 1)).astype(int)], 2]
     slope_allowance_m = 0.1 * _CELL_M
-    return points[:, 2] - lowest[cell] <= max_height_m + slope_allowance_m
+    return points[:, 2] - low[cell] <= max_height_m + slope_allowance_m
 
 
 def _filled(points: np.ndarray, rows: np.ndarray, ground: np.ndarray, height_m: float) -> np.ndarray:

@@ -63,6 +63,8 @@ class _Component:
     match_index: np.ndarray
     match_target: np.ndarray
     edges: np.ndarray
+    tied: np.ndarray
+    tie: np.ndarray
 
 
 def _components(problem: FlowProblem):
@@ -72,13 +74,16 @@ def _components(problem: FlowProblem):
     rows_of = _grouped(problem.component, count)
     matches_of = _grouped(problem.component[problem.match_index], count)
     edges_of = _grouped(problem.component[problem.edges[:, 0]], count)
+    group = problem.group if len(problem.group) else np.full(len(problem.points), -1)
     for rows, matches, edges in zip(rows_of, matches_of, edges_of, strict=True):
         if len(matches) == 0:
             continue
         local[rows] = np.arange(len(rows))
+        tied = np.flatnonzero(group[rows] >= 0)
         yield _Component(
             rows, problem.points[rows], problem.initial[rows], local[problem.match_index[matches]],
-            problem.match_target[matches], local[problem.edges[edges]])
+            problem.match_target[matches], local[problem.edges[edges]], tied,
+            problem.group_motions[group[rows[tied]]])
 
 
 def _grouped(label: np.ndarray, count: int) -> list[np.ndarray]:
@@ -91,9 +96,12 @@ def _solve_component(part: _Component, config: SolverConfig) -> tuple[np.ndarray
     smoothness = _smoothness_factors(part, config)
     values = _values(part.initial, part.points)
     steps = []
-    for noise in (_data_noise(config), _robust_data_noise(config)):
+    noises = ((_data_noise(config), _tie_noise(config)),
+              (_robust_data_noise(config), _robust_tie_noise(config)))
+    for data_noise, tie_noise in noises:
         graph = gtsam.NonlinearFactorGraph(smoothness)
-        graph.push_back(_data_factors(part, noise))
+        graph.push_back(_data_factors(part, data_noise))
+        graph.push_back(_tie_factors(part, tie_noise))
         values, step = _optimise(graph, values, config)
         steps.append(step)
     return _motions(values, part.points), steps[0], steps[1]
@@ -120,6 +128,26 @@ def _data_factors(part: _Component, noise) -> gtsam.NonlinearFactorGraph:
     for i, target in zip(part.match_index.tolist(), part.match_target, strict=True):
         graph.add(gtsam.PoseTranslationPrior3D(i, target, noise))
     return graph
+
+
+def _tie_factors(part: _Component, noise) -> gtsam.NonlinearFactorGraph:
+    """The tie of a variable to its group's motion G: the twist from G to τ_i, seen at the point."""
+    graph = gtsam.NonlinearFactorGraph()
+    moved = pose.apply(part.tie, part.points[part.tied])
+    for i, motion, place in zip(part.tied.tolist(), part.tie, moved, strict=True):
+        graph.add(gtsam.PriorFactorPose3(i, gtsam.Pose3(gtsam.Rot3(motion[:3, :3]), place), noise))
+    return graph
+
+
+def _tie_noise(config: SolverConfig):
+    return gtsam.noiseModel.Isotropic.Precision(6, config.tie_weight)
+
+
+def _robust_tie_noise(config: SolverConfig):
+    """Truncated: a point that its matches and neighbours pull away farther than this is let go."""
+    kernel = gtsam.noiseModel.mEstimator.TruncatedLeastSquares(
+        config.tie_truncation * np.sqrt(config.tie_weight))
+    return gtsam.noiseModel.Robust.Create(kernel, _tie_noise(config))
 
 
 def _data_noise(config: SolverConfig):

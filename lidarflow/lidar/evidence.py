@@ -1,0 +1,58 @@
+"""What ego-motion alone leaves unexplained, and whether the sensor could have seen otherwise."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidarflow.config import ObjectsConfig
+
+_DIRECTIONS = 6              # returns next to a line of sight
+_MAX_ANGLE_RAD = np.radians(1.5)
+_MIN_DIRECTIONS = 2
+_OCCLUDER_M = 0.4            # a return this much nearer hides what is behind it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What a cloud, brought to another scan's frame, finds there.
+
+    left_m       (N,) float   distance to the nearest point of the other scan
+    unexplained  (N,) bool    too far from it, although the sensor looked there and saw past nothing nearer
+    blind        (N,) bool    too far from it, but hidden or out of view: no evidence of anything
+    """
+
+    left_m: np.ndarray
+    unexplained: np.ndarray
+    blind: np.ndarray
+
+
+def gather(points: np.ndarray, other: np.ndarray, config: ObjectsConfig) -> Evidence:
+    """Evidence of `points` (N, 3) against `other` (M, 3), metres, both in the sensor frame of `other`."""
+    left_m, _ = cKDTree(other).query(points, workers=-1)
+    range_m = np.linalg.norm(points, axis=1)
+    far = np.flatnonzero(left_m > tolerance(range_m, config))
+    seen = _looked_there(points[far], range_m[far], other)
+    unexplained, blind = np.zeros((2, len(points)), bool)
+    unexplained[far[seen]] = True
+    blind[far[~seen]] = True
+    return Evidence(left_m, unexplained, blind)
+
+
+def tolerance(range_m: np.ndarray, config: ObjectsConfig) -> np.ndarray:
+    """How far (N,) in metres a point may be from the next scan's nearest: scan lines spread with range."""
+    return config.near_m + config.near_share * range_m
+
+
+def _looked_there(points: np.ndarray, range_m: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Whether (N,) the other scan has returns around each line of sight, none of them well in front."""
+    if len(points) == 0:
+        return np.zeros(0, bool)
+    other_range_m = np.linalg.norm(other, axis=1)
+    directions = cKDTree(other / np.maximum(other_range_m, 1e-6)[:, None])
+    apart, nearest = directions.query(
+        points / np.maximum(range_m, 1e-6)[:, None], k=_DIRECTIONS, distance_upper_bound=_MAX_ANGLE_RAD,
+        workers=-1)
+    found = np.isfinite(apart)
+    beside_m = np.where(found, other_range_m[np.minimum(nearest, len(other) - 1)], np.inf)
+    return (found.sum(axis=1) >= _MIN_DIRECTIONS) & (beside_m.min(axis=1) >= range_m - _OCCLUDER_M)
