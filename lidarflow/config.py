@@ -135,9 +135,10 @@ class ObjectsConfig:
     min_speed_m_per_s: float = setting(0.5, "slower objects count as static", low=0)
     min_matches: int = setting(3, "descriptor matches that must follow an object's motion", low=0)
     min_unexplained: float = setting(
-        0.1, "share of an object's points that ego-motion must leave unexplained", low=0, high=1)
+        0.1, "share of an object's points that ego-motion must leave unexplained in either scan",
+        low=0, high=1)
     max_misfit_ratio: float = setting(
-        0.35, "an object's own motion must bring its mean squared misfits, that of shape times that of "
+        0.15, "an object's own motion must bring its mean squared misfits, that of shape times that of "
         "matches, down to this share", low=0, high=1)
 
 

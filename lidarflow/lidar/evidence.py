@@ -1,4 +1,7 @@
-"""What ego-motion alone leaves unexplained, and whether the sensor could have seen otherwise."""
+"""What ego-motion alone leaves unexplained, and whether the sensor looked there at all.
+
+What hides a place does not excuse it: a car that comes nearer hides the place where it was.
+"""
 
 from dataclasses import dataclass
 
@@ -7,10 +10,8 @@ from scipy.spatial import cKDTree
 
 from lidarflow.config import ObjectsConfig
 
-_DIRECTIONS = 6              # returns next to a line of sight
 _MAX_ANGLE_RAD = np.radians(1.5)
 _MIN_DIRECTIONS = 2
-_OCCLUDER_M = 0.4            # a return this much nearer hides what is behind it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,8 +19,8 @@ class Evidence:
     """What a cloud, brought to another scan's frame, finds there.
 
     left_m       (N,) float   distance to the nearest point of the other scan
-    unexplained  (N,) bool    too far from it, although the sensor looked there and saw past nothing nearer
-    blind        (N,) bool    too far from it, but hidden or out of view: no evidence of anything
+    unexplained  (N,) bool    too far from it, although the sensor looked in that direction
+    blind        (N,) bool    too far from it, but out of view: no evidence of anything
     """
 
     left_m: np.ndarray
@@ -32,7 +33,7 @@ def gather(points: np.ndarray, other: np.ndarray, config: ObjectsConfig) -> Evid
     left_m, _ = cKDTree(other).query(points, workers=-1)
     range_m = np.linalg.norm(points, axis=1)
     far = np.flatnonzero(left_m > tolerance(range_m, config))
-    seen = _looked_there(points[far], range_m[far], other)
+    seen = _looked_there(points[far] / np.maximum(range_m[far], 1e-6)[:, None], other)
     unexplained, blind = np.zeros((2, len(points)), bool)
     unexplained[far[seen]] = True
     blind[far[~seen]] = True
@@ -44,15 +45,11 @@ def tolerance(range_m: np.ndarray, config: ObjectsConfig) -> np.ndarray:
     return config.near_m + config.near_share * range_m
 
 
-def _looked_there(points: np.ndarray, range_m: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Whether (N,) the other scan has returns around each line of sight, none of them well in front."""
-    if len(points) == 0:
+def _looked_there(directions: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Whether (N,) the other scan (M, 3) has returns around each direction (N, 3), of unit length."""
+    if len(directions) == 0:
         return np.zeros(0, bool)
     other_range_m = np.linalg.norm(other, axis=1)
-    directions = cKDTree(other / np.maximum(other_range_m, 1e-6)[:, None])
-    apart, nearest = directions.query(
-        points / np.maximum(range_m, 1e-6)[:, None], k=_DIRECTIONS, distance_upper_bound=_MAX_ANGLE_RAD,
-        workers=-1)
-    found = np.isfinite(apart)
-    beside_m = np.where(found, other_range_m[np.minimum(nearest, len(other) - 1)], np.inf)
-    return (found.sum(axis=1) >= _MIN_DIRECTIONS) & (beside_m.min(axis=1) >= range_m - _OCCLUDER_M)
+    apart, _ = cKDTree(other / np.maximum(other_range_m, 1e-6)[:, None]).query(
+        directions, k=_MIN_DIRECTIONS, distance_upper_bound=_MAX_ANGLE_RAD, workers=-1)
+    return np.isfinite(apart).all(axis=1)

@@ -50,7 +50,7 @@ class View:
     evidence       Evidence    of the points against the whole target
     target         cKDTree     all of the target's usable points
     upright        cKDTree     those of them that are not ground
-    appeared       (A, 3)      upright target points where the source has nothing after ego-motion
+    has_appeared   (U,) bool   upright points where the source has nothing after ego-motion
     match_rows     (K,) int64  points with a descriptor match
     match_shift    (K, 3)      from such a point to its match
     """
@@ -59,7 +59,7 @@ class View:
     evidence: Evidence
     target: cKDTree
     upright: cKDTree
-    appeared: np.ndarray
+    has_appeared: np.ndarray
     match_rows: np.ndarray
     match_shift: np.ndarray
 
@@ -74,11 +74,11 @@ def look(
     source_points (S, 3) all of the source; matched: rows (K,) of `points` and their matches (K, 3).
     """
     upright = target_points[~target_ground]
-    appeared_m, _ = cKDTree(source_points).query(upright, workers=-1)
-    appeared = upright[appeared_m > tolerance(np.linalg.norm(upright, axis=1), config)]
+    from_source_m, _ = cKDTree(source_points).query(upright, workers=-1)
+    has_appeared = from_source_m > tolerance(np.linalg.norm(upright, axis=1), config)
     rows, places = matched
     return View(points, gather(points, target_points, config), cKDTree(target_points), cKDTree(upright),
-                appeared, rows, places - points[rows])
+                has_appeared, rows, places - points[rows])
 
 
 def find(view: View, dt_s: float, config: ObjectsConfig) -> list[Body]:
@@ -159,10 +159,11 @@ def _match_translations(view: View, points: np.ndarray) -> list[np.ndarray]:
 
 def _voted_translations(view: View, points: np.ndarray, max_shift_m: float = 3.0) -> list[np.ndarray]:
     """The three translations that most often lead from these points to what appeared near them."""
-    if len(view.appeared) == 0:
+    appeared = view.upright.data[view.has_appeared]
+    if len(appeared) == 0:
         return []
-    distance_m, _ = cKDTree(points).query(view.appeared, distance_upper_bound=max_shift_m)
-    near = _spread(view.appeared[np.isfinite(distance_m)], 2 * _MAX_VOTERS)
+    distance_m, _ = cKDTree(points).query(appeared, distance_upper_bound=max_shift_m)
+    near = _spread(appeared[np.isfinite(distance_m)], 2 * _MAX_VOTERS)
     if len(near) < 4:
         return []
     shifts = (near[None] - _spread(points, _MAX_VOTERS)[:, None]).reshape(-1, 3)
@@ -227,13 +228,25 @@ def _moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
     what looks alike; the two are deceived by different things, so their ratios of misfit multiply.
     """
     points = view.points[body.rows]
-    shift = (pose.apply(body.over_ground, points) - points).mean(axis=0)
+    moved = pose.apply(body.over_ground, points)
+    shift = (moved - points).mean(axis=0)
     if np.hypot(shift[0], shift[1]) < config.min_speed_m_per_s * dt_s:
         return False
-    if view.evidence.unexplained[body.rows].mean() < config.min_unexplained:
+    left = view.evidence.unexplained[body.rows].mean()
+    if min(left, _arrived(view, moved)) < config.min_unexplained:
         return False
     by_shape, by_matches = _shape_ratio(view, body), _match_ratio(view, body, config)
     return max(by_shape, by_matches) < 1.0 and by_shape * by_matches <= config.max_misfit_ratio
+
+
+def _arrived(view: View, moved: np.ndarray) -> float:
+    """Share of the moved points (K, 3) that end where the source, as it stood, had nothing.
+
+    What a newcomer hides seems to have left, but has arrived nowhere new.
+    """
+    off_m, nearest = view.upright.query(moved, distance_upper_bound=_CAP_M)
+    found = np.isfinite(off_m)
+    return float(view.has_appeared[nearest[found]].mean()) if found.any() else 0.0
 
 
 def _shape_ratio(view: View, body: Body) -> float:
