@@ -40,7 +40,8 @@ def pair_of_points(seed: int, apart: float):
     motions = np.stack([first, first @ pose.exp(random.normal(scale=apart, size=6))])
     target = pose.apply(motions[1], points[1]) + random.normal(scale=0.1, size=3)
     return gtsam_lm._Component(
-        np.arange(2), points, motions, np.array([1]), target[None], np.array([[0, 1]]))
+        np.arange(2), points, motions, np.array([1]), target[None], np.array([[0, 1]]),
+        np.empty(0, np.int64), np.empty((0, 4, 4)))
 
 
 def smoothness_factor(part, config: SolverConfig):

@@ -88,12 +88,12 @@ def test_crispness_is_a_mean_and_leaves_nan_rows_out():
     assert np.isnan(metrics.crispness(points, target[2:], SIGMA_M))
 
 
-def test_alignment_looks_at_solved_points_of_the_graph_alone():
+def test_alignment_looks_at_known_points_above_ground_alone():
     points = np.arange(9.0).reshape(3, 3) * 10
     flow = np.array([[0.0, 0.4, 0], [5, 5, 5], [5, 5, 5]])
-    solved, in_graph = np.array([True, False, True]), np.array([True, True, False])
-    result = FlowResult(flow, pose.from_translation(flow), solved, in_graph, np.zeros(3, bool),
-                        pose.from_translation([0.0, 0.2, 0.0]), STATS)
+    known, on_ground = np.array([True, False, True]), np.array([False, False, True])
+    result = FlowResult(flow, pose.from_translation(flow), known, np.zeros(3, bool), np.zeros(3, bool),
+                        pose.from_translation([0.0, 0.2, 0.0]), STATS, is_ground=on_ground)
     target = Scan(points[:1] + [0, 0.4, 0])
     found = metrics.alignment(Scan(points), target, result, SIGMA_M)
     assert (found.before, found.by_ego, found.after) == pytest.approx((np.exp(-1), np.exp(-0.25), 1.0))
