@@ -4,13 +4,15 @@ Files are written aside and moved into place, so that a reader never meets half 
 """
 
 import contextlib
+import csv
 import json
 import os
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +27,16 @@ from lidarflow.types import FlowResult
 FLOW_FOLDER = "flow"
 CONFIG_FILE = "config.toml"
 RECORDING_FILE = "recording.rrd"
-RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", "metrics.json", "timing.json", RECORDING_FILE,
-                "preview.png")
+OBJECTS_FILE = "objects.csv"
+RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", "metrics.json", "timing.json", OBJECTS_FILE,
+                RECORDING_FILE, "preview.png")
+OBJECT_COLUMNS = ("frame", "id", "points", "x", "y", "z", "length", "width", "height", "yaw",
+                  "vx", "vy", "vz", "speed_m_per_s")
 LATEST = "latest"
 
 # name: (shape, after N for the arrays with a row per point; dtype kind)
 _ROW_ARRAYS = {"flow": ((3,), "f"), "points": ((3,), "f"), "motion": ((7,), "f"), "valid": ((), "b"),
-               "in_graph": ((), "b"), "is_dynamic": ((), "b")}
+               "in_graph": ((), "b"), "is_dynamic": ((), "b"), "object": ((), "i")}
 _WHOLE_ARRAYS = {"ego_motion": ((4, 4), "f"), "config": ((), "U"), "stats": ((), "U")}
 
 
@@ -45,6 +50,7 @@ class FlowFile:
     valid       (N,) bool          the motion rests on evidence
     in_graph    (N,) bool          the motion was solved for
     is_dynamic  (N,) bool          moves over ground by itself
+    object_id   (N,) int32         the moving object the point is on, -1 = none
     ego_motion  (4, 4) float64     target_from_source of the static world
     config      dict               the settings it was made with
     stats       dict               what the solver did
@@ -56,6 +62,7 @@ class FlowFile:
     valid: np.ndarray
     in_graph: np.ndarray
     is_dynamic: np.ndarray
+    object_id: np.ndarray
     ego_motion: np.ndarray
     config: dict
     stats: dict
@@ -97,6 +104,7 @@ def save_flow(path: Path, points: np.ndarray, result: FlowResult, config: Config
         "valid": result.valid,
         "in_graph": result.in_graph,
         "is_dynamic": result.is_dynamic,
+        "object": result.object_id.astype(np.int32),
         "ego_motion": result.ego_motion.astype(np.float64),
         "config": np.array(_to_json(to_dict(config))),
         "stats": np.array(_to_json(asdict(result.stats))),
@@ -124,7 +132,7 @@ def load_flow(path: Path) -> FlowFile:
     if not pose.is_rigid(ego_motion, 1e-4) or not isinstance(config, dict) or not isinstance(stats, dict):
         raise DataError(f"{path}: damaged flow file; its ego_motion, config or stats make no sense")
     return FlowFile(arrays["points"], arrays["flow"], motions, arrays["valid"], arrays["in_graph"],
-                    arrays["is_dynamic"], ego_motion, config, stats)
+                    arrays["is_dynamic"], arrays["object"], ego_motion, config, stats)
 
 
 def write_poses_kitti(path: Path, world_from_sensor: np.ndarray) -> None:
@@ -139,6 +147,17 @@ def write_poses_tum(path: Path, world_from_sensor: np.ndarray, times_ns: list[in
     lines = [f"{time_ns // 10**9}.{time_ns % 10**9:09d} {_joined(row)}\n"
              for time_ns, row in zip((int(time_ns) for time_ns in times_ns), rows, strict=True)]
     _write_text(path, "".join(lines))
+
+
+def write_objects(path: Path, rows: Iterable[tuple]) -> None:
+    """Write moving objects as CSV, a row each with the values of OBJECT_COLUMNS; decimals are 0.1 mm."""
+    text = StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(OBJECT_COLUMNS)
+    for frame, number, points, *values in rows:
+        # Adding zero turns -0.0 into 0.0.
+        table.writerow([frame, number, points, *(f"{round(float(value), 4) + 0.0:.4f}" for value in values)])
+    _write_text(path, text.getvalue())
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -48,6 +48,11 @@ def apply(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.einsum("...ij,...j->...i", motion[..., :3, :3], points) + motion[..., :3, 3]
 
 
+def turn(motion: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3), such as velocities, in the axes that a motion (4, 4) leads to; nothing is shifted."""
+    return vectors @ motion[:3, :3].T
+
+
 def hat(vector: np.ndarray) -> np.ndarray:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     vector = np.asarray(vector, float)
@@ -122,6 +127,13 @@ def from_translation_quaternion(rows: np.ndarray) -> np.ndarray:
     rows = np.asarray(rows, float)
     rotation = Rotation.from_quat(rows[..., 3:].reshape(-1, 4)).as_matrix()
     return from_rotation_translation(rotation.reshape(*rows.shape[:-1], 3, 3), rows[..., :3])
+
+
+def yaw_quaternion(yaw: np.ndarray) -> np.ndarray:
+    """Quaternions (..., 4) of turns about z by `yaw` (...) radians."""
+    half = np.asarray(yaw, float) / 2.0
+    zero = np.zeros_like(half)
+    return np.stack([zero, zero, np.sin(half), np.cos(half)], axis=-1)
 
 
 def is_rigid(motion: np.ndarray, tolerance: float = 1e-6) -> bool:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lidarflow import colour
+from lidarflow import colour, pose
 from lidarflow.types import FlowResult, ScanPair
 
 _TEXT = (220, 220, 220)
@@ -15,10 +15,11 @@ _SENSOR_M = 0.8
 
 def bird_eye(points: np.ndarray, colours: np.ndarray, is_dynamic: np.ndarray, residual_flow: np.ndarray,
              half_width_m: float = 40.0, size_px: int = 1200, dt_s: float = 0.1,
-             caption: str = "") -> Image.Image:
+             caption: str = "", arrows: tuple[np.ndarray, np.ndarray] | None = None) -> Image.Image:
     """Picture of a scan from above, moving points on top, an arrow as long as each object moves in a second.
 
-    points, residual_flow (N, 3) metres, sensor frame; colours (N, 3) uint8; is_dynamic (N,) bool.
+    points, residual_flow (N, 3) metres, sensor frame; colours (N, 3) uint8; is_dynamic (N,) bool; arrows are
+    starts (K, 3) in metres and velocities (K, 3) in m/s, one for each group of moving points if not given.
     """
     scale = size_px / (2.0 * half_width_m)
     pixels = np.full((size_px, size_px, 3), colour.BACKGROUND, np.uint8)
@@ -27,8 +28,10 @@ def bird_eye(points: np.ndarray, colours: np.ndarray, is_dynamic: np.ndarray, re
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image)
     _draw_sensor(draw, scale, size_px)
-    tops, moved = colour.moving_objects(points, residual_flow, is_dynamic)
-    _draw_arrows(draw, tops, moved / dt_s, scale, size_px)
+    if arrows is None:
+        tops, moved = colour.moving_objects(points, residual_flow, is_dynamic)
+        arrows = tops, moved / dt_s
+    _draw_arrows(draw, *arrows, scale, size_px)
     _draw_scale_bar(draw, scale, size_px)
     legend_px = size_px // 4
     image.paste(Image.fromarray(colour.wheel(legend_px)), (size_px - legend_px, 0))
@@ -44,8 +47,17 @@ def write_preview(path: Path, pair: ScanPair, result: FlowResult) -> None:
     colours = colour.scene_colours(points, residual_flow, result.is_dynamic, pair.dt_s)
     caption = f"{pair.source.name}: {int(result.is_dynamic.sum())} of {len(points)} points move over ground"
     image = bird_eye(points, colours, result.is_dynamic, residual_flow, half_width_m=_half_width(points),
-                     dt_s=pair.dt_s, caption=caption)
+                     dt_s=pair.dt_s, caption=caption, arrows=_arrows_of(result))
     image.save(path, format="PNG")
+
+
+def _arrows_of(result: FlowResult) -> tuple[np.ndarray, np.ndarray] | None:
+    """Middles (K, 3) in metres and velocities (K, 3) in m/s of the objects, source frame; None if none."""
+    if not result.objects:
+        return None
+    velocity = np.stack([found.velocity for found in result.objects])
+    middles = np.stack([found.box_centre for found in result.objects])
+    return middles, pose.turn(pose.inverse(result.ego_motion), velocity)
 
 
 def _half_width(points: np.ndarray) -> float:
@@ -87,7 +99,7 @@ def _draw_arrows(draw: ImageDraw.ImageDraw, tops: np.ndarray, velocity: np.ndarr
     starts, tips = _to_pixel(tops, scale, size_px), _to_pixel(tops + velocity, scale, size_px)
     inside = ((starts >= 0) & (starts < size_px)).all(axis=1)
     starts, tips = starts[inside], tips[inside]
-    speed_m_per_s = np.hypot(velocity[inside, 0], velocity[inside, 1])
+    speed_m_per_s = np.linalg.norm(velocity[inside], axis=1)
     for start, tip in zip(starts, tips, strict=True):
         _draw_arrow(draw, start, tip, size_px)
     taken = [tuple(box) for box in np.hstack([np.minimum(starts, tips), np.maximum(starts, tips)])]

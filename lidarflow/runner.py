@@ -64,7 +64,7 @@ def process(
 ) -> list[PairReport]:
     """Process `frames` of a data set and write a run folder; `on_pair` hears of every finished pair.
 
-    Flow files are complete as soon as they appear; poses, metrics, recording and picture follow at the end.
+    Flow files are complete as soon as they appear; poses, objects, metrics, recording and picture follow.
     Raises LidarflowError for input or output that cannot be used.
     """
     # The first pair is done before the folder is touched: a bad data set leaves no empty run behind.
@@ -74,7 +74,7 @@ def process(
     first = next(results)
     io.new_run_folder(out)
     io.write_toml(out / io.CONFIG_FILE, config)
-    world_from_sensor, times_ns = [np.eye(4)], []
+    world_from_sensor, times_ns, objects = [np.eye(4)], [], []
     with _recording(out / io.RECORDING_FILE, viewing) as stream:
         for index, (pair, result) in zip(frames, _chained(first, results), strict=False):
             begin = time.perf_counter()
@@ -87,12 +87,14 @@ def process(
                 viewer.log_pair(stream, index, pair, result, score, world_from_sensor[-1], viewing.arrows)
             world_from_sensor.append(world_from_sensor[-1] @ pose.inverse(result.ego_motion))
             times_ns.append(pair.source.time_ns)
+            objects += _object_rows(pair.source.name, result)
             with_output = {**report.seconds, "scores and output": time.perf_counter() - begin}
             reports.append(replace(report, seconds=with_output))
             on_pair(reports[-1])
     poses = np.stack(world_from_sensor)
     io.write_poses_kitti(out / "poses_kitti.txt", poses)
     io.write_poses_tum(out / "poses_tum.txt", poses, [*times_ns, pair.target.time_ns])
+    io.write_objects(out / io.OBJECTS_FILE, objects)
     with io.written_aside(out / "preview.png") as aside:
         preview.write_preview(aside, pair, result)
     io.write_json(out / "metrics.json", metrics_of(reports, config))
@@ -172,6 +174,15 @@ def report_pair(
         stats=result.stats,
         seconds=result.seconds,
     )
+
+
+def _object_rows(frame: str, result: FlowResult) -> list[tuple]:
+    """A row of io.OBJECT_COLUMNS for every moving object, all in the source frame."""
+    source_from_target = pose.inverse(result.ego_motion)
+    return [
+        (frame, found.id, found.points, *found.box_centre, *found.box_size, found.box_yaw,
+         *pose.turn(source_from_target, found.velocity), np.linalg.norm(found.velocity))
+        for found in result.objects]
 
 
 def _chained(first, rest) -> Iterator[tuple[ScanPair, FlowResult]]:

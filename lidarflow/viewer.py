@@ -22,7 +22,8 @@ from lidarflow.types import FlowResult, ScanPair
 FRAME, TIME = "frame", "time"
 SOURCE, TARGET, TRAJECTORY = "world/source", "world/target", "world/trajectory"
 STATIC, MOVING = f"{SOURCE}/static", f"{SOURCE}/moving"
-RESIDUAL_ARROWS, OBJECT_ARROWS = f"{SOURCE}/residual_flow", f"{SOURCE}/objects_in_1s"
+OBJECTS, OBJECT_ARROWS = f"{SOURCE}/objects", f"{SOURCE}/objects_in_1s"
+RESIDUAL_ARROWS = f"{SOURCE}/residual_flow"
 TOTAL_ARROWS, MATCHES = f"{SOURCE}/total_flow", f"{SOURCE}/matches"
 SENSOR = f"{SOURCE}/sensor"
 NEXT, MOVED = f"{TARGET}/next_scan", f"{TARGET}/moved_scan"
@@ -31,6 +32,7 @@ CRISPNESS, WHEEL = "crispness", "wheel"
 MAX_RESIDUAL_ARROWS = 3000
 MAX_TOTAL_ARROWS = 20000
 _STATIC_PX, _MOVING_PX, _OVERLAY_PX = 1.2, 2.6, 1.0
+_BOX_PX, _OBJECT_ARROW_PX = 1.0, 2.0
 _ARROW_ABOVE_M = 0.4
 _WHEEL_PX = 420
 _SENSOR_OUTLINE = np.array([(1.2, 0, 0), (-0.8, 0.8, 0), (-0.4, 0, 0), (-0.8, -0.8, 0), (1.2, 0, 0)])
@@ -75,6 +77,11 @@ def log_pair(stream: rr.RecordingStream, index: int, pair: ScanPair, result: Flo
     points = pair.source.points
     _log_frames(stream, world_from_source, result.ego_motion)
     _log_motion(stream, points, result.flow, result.is_dynamic, result.ego_motion, pair.dt_s)
+    _log_boxes(stream, result)
+    if result.objects:
+        _log_arrows_of_objects(stream, result)
+    else:
+        _log_arrows_of_groups(stream, points, result.flow, result.is_dynamic, result.ego_motion, pair.dt_s)
     _log_alignment(stream, points, result.flow, pair.target.points)
     _log_matches(stream, result)
     if arrows:
@@ -94,6 +101,7 @@ def log_flow(stream: rr.RecordingStream, points: np.ndarray, flow: np.ndarray, i
     stream.set_time(FRAME, sequence=0)
     _log_frames(stream, pose.identity(), ego_motion)
     _log_motion(stream, points, flow, is_dynamic, ego_motion, dt_s)
+    _log_arrows_of_groups(stream, points, flow, is_dynamic, ego_motion, dt_s)
     _log_alignment(stream, points, flow, target_points)
 
 
@@ -186,11 +194,36 @@ def _log_motion(stream: rr.RecordingStream, points: np.ndarray, flow: np.ndarray
     _log_points(stream, MOVING, points[moving], colours[moving], _MOVING_PX)
     shown = _thinned(moving, MAX_RESIDUAL_ARROWS)
     _log_arrows(stream, RESIDUAL_ARROWS, points[shown], residual_flow[shown], colours[shown], 0.7)
-    tops, moved = colour.moving_objects(points, residual_flow, moving)
+
+
+def _log_boxes(stream: rr.RecordingStream, result: FlowResult) -> None:
+    """A box, number and speed over ground for every moving object; no objects clear the frame before."""
+    found = result.objects
+    stream.log(OBJECTS, rr.Boxes3D(
+        centers=np.array([o.box_centre for o in found]).reshape(-1, 3),
+        half_sizes=np.array([o.box_size for o in found]).reshape(-1, 3) / 2.0,
+        quaternions=pose.yaw_quaternion([o.box_yaw for o in found]), colors=[colour.ARROW],
+        radii=rr.Radius.ui_points(_BOX_PX), fill_mode="majorwireframe", show_labels=True,
+        labels=[f"id {o.id}: {np.linalg.norm(o.velocity):.1f} m/s" for o in found]))
+
+
+def _log_arrows_of_objects(stream: rr.RecordingStream, result: FlowResult) -> None:
+    """The way of every moving object in one second, from the top of its box, whose label says the speed."""
+    tops = np.stack([o.box_centre + (0.0, 0.0, o.box_size[2] / 2.0) for o in result.objects])
+    velocity = np.stack([o.velocity for o in result.objects])
+    _log_arrows(stream, OBJECT_ARROWS, tops, pose.turn(pose.inverse(result.ego_motion), velocity),
+                [colour.ARROW], _OBJECT_ARROW_PX)
+
+
+def _log_arrows_of_groups(stream: rr.RecordingStream, points: np.ndarray, flow: np.ndarray,
+                          is_dynamic: np.ndarray, ego_motion: np.ndarray, dt_s: float) -> None:
+    """The way of every group of moving points in one second, and its speed."""
+    residual_flow = pose.apply(pose.inverse(ego_motion), points + flow) - points
+    tops, moved = colour.moving_objects(points, residual_flow, is_dynamic)
     speed_m_per_s = np.linalg.norm(moved, axis=1) / dt_s
     stream.log(OBJECT_ARROWS, rr.Arrows3D(
         origins=tops + (0.0, 0.0, _ARROW_ABOVE_M), vectors=moved / dt_s, colors=[colour.ARROW],
-        radii=rr.Radius.ui_points(2.0), labels=[f"{speed:.1f} m/s" for speed in speed_m_per_s]))
+        radii=rr.Radius.ui_points(_OBJECT_ARROW_PX), labels=[f"{speed:.1f} m/s" for speed in speed_m_per_s]))
 
 
 def _log_alignment(stream: rr.RecordingStream, points: np.ndarray, flow: np.ndarray,

@@ -28,11 +28,11 @@ from lidarflow import (
 )
 
 CONTRACT = {"flow": ("float32", (3,)), "motion": ("float32", (7,)), "valid": ("bool", ()),
-            "is_dynamic": ("bool", ())}
-RUN_FILES = {"config.toml", "flow", "metrics.json", "poses_kitti.txt", "poses_tum.txt", "preview.png",
-             "recording.rrd", "timing.json"}
-RUNS_THE_SAME = ("config.toml", "metrics.json", "poses_kitti.txt", "poses_tum.txt", "preview.png",
-                 "flow/000000.npz", "flow/000001.npz")
+            "is_dynamic": ("bool", ()), "object": ("int32", ())}
+RUN_FILES = {"config.toml", "flow", "metrics.json", "objects.csv", "poses_kitti.txt", "poses_tum.txt",
+             "preview.png", "recording.rrd", "timing.json"}
+RUNS_THE_SAME = ("config.toml", "metrics.json", "objects.csv", "poses_kitti.txt", "poses_tum.txt",
+                 "preview.png", "flow/000000.npz", "flow/000001.npz")
 PROGRAM = [sys.executable, "-c", "from lidarflow.cli import main; main()"]
 HEAVY = ("gtsam", "open3d", "numba", "rerun", "scipy", "kiss_icp", "PIL", "pyarrow", "numpy")
 OFF = ("--set", "preparation.kitti_correction=off")
@@ -192,6 +192,45 @@ def test_poses_of_a_run_follow_the_drive(finished):
     assert tum.shape == (3, 8)
     np.testing.assert_allclose(tum[:, 0], [0, 0.1, 0.2], atol=1e-6)
     np.testing.assert_allclose(tum[:, 1:4], rows[:, :, 3], atol=1e-9)
+
+
+def test_objects_of_a_run_are_boxes_around_their_points_that_move_as_they_do(finished):
+    out, _ = finished
+    header, *rows = (out / "objects.csv").read_text().splitlines()
+    assert header == "frame,id,points,x,y,z,length,width,height,yaw,vx,vy,vz,speed_m_per_s"
+    for k, frame in enumerate(("000000", "000001")):
+        found, truth = io.load_flow(out / "flow" / f"{frame}.npz"), drive()[k][1]
+        over_ground = metres_over_ground(found.points, found.flow, found.ego_motion)
+        true_over_ground = metres_over_ground(drive()[k][0].points, truth.flow, truth.ego_motion)
+        of_frame = np.array([line.split(",")[1:] for line in rows if line.split(",")[0] == frame], float)
+        assert of_frame[:, 0].tolist() == list(range(found.object_id.max() + 1))
+        real_movers = 0
+        for number, count, *numbers, speed in of_frame:
+            centre, size, yaw, velocity = np.split(np.array(numbers), [3, 6, 7])
+            on_it = found.object_id == number
+            assert on_it.sum() == count and speed == pytest.approx(np.linalg.norm(velocity), abs=1e-3)
+            box_from_source = pose.inverse(pose.from_yaw(yaw.item(), centre))
+            in_box = pose.apply(box_from_source, found.points[on_it].astype(float))
+            assert (np.abs(in_box) <= size / 2 + 1e-3).all()
+            assert np.cos(np.arctan2(velocity[1], velocity[0]) - yaw) > 0.9999, "the length is the way"
+            np.testing.assert_allclose(velocity, over_ground[on_it].mean(axis=0) / 0.1, atol=0.2)
+            if truth.is_dynamic[on_it].all():
+                real_movers += 1
+                np.testing.assert_allclose(velocity, true_over_ground[on_it].mean(axis=0) / 0.1, atol=1.5)
+        assert real_movers >= 3
+    assert len(rows) == sum(line.startswith(("000000,", "000001,")) for line in rows)
+
+
+def metres_over_ground(points, flow, ego_motion):
+    """What points (N, 3) move by besides the sensor's own motion, in the source's axes."""
+    return pose.apply(pose.inverse(ego_motion), points + flow) - points
+
+
+def test_a_run_without_objects_says_so(lidarflow, scans, tmp_path):
+    lidarflow.ok("run", scans[0].parent, "-n", 2, "--set", "objects.enabled=false", "--out",
+                 tmp_path / "out", "--no-record")
+    assert (tmp_path / "out" / "objects.csv").read_text().count("\n") == 1
+    assert (io.load_flow(tmp_path / "out" / "flow" / "000000.npz").object_id == -1).all()
 
 
 def test_metrics_of_a_run_are_scores_against_the_truth(finished):

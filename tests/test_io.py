@@ -4,6 +4,7 @@ import json
 import os
 import time
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,7 +33,8 @@ def some_result(count=5, seconds=1.0):
     valid, in_graph, is_dynamic = rng.random((3, count)) < 0.5
     result = FlowResult(flow=flow, motions=motions, valid=valid, in_graph=in_graph,
                         is_dynamic=is_dynamic, ego_motion=pose.from_yaw(0.1, (1, 2, 3)),
-                        stats=some_stats(), seconds={"solve": seconds})
+                        stats=some_stats(), seconds={"solve": seconds},
+                        object_id=np.arange(-1, count - 1))
     return points, result
 
 
@@ -58,7 +60,7 @@ def test_a_flow_file_comes_back(saved):
     np.testing.assert_allclose(loaded.points, points, rtol=1e-6)
     np.testing.assert_allclose(loaded.flow, result.flow, rtol=1e-5)
     np.testing.assert_allclose(loaded.motions, result.motions, atol=1e-5)
-    for name in ("valid", "in_graph", "is_dynamic", "ego_motion"):
+    for name in ("valid", "in_graph", "is_dynamic", "object_id", "ego_motion"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(result, name))
     assert settings.updated(Config(), loaded.config) == Config()
     assert SolveStats(**loaded.stats) == result.stats
@@ -67,13 +69,19 @@ def test_a_flow_file_comes_back(saved):
 def test_a_flow_file_is_the_stable_contract(saved):
     with np.load(saved, allow_pickle=False) as archive:
         found = {name: (archive[name].shape, archive[name].dtype.kind) for name in archive.files}
-        dtypes = {name: archive[name].dtype for name in ("flow", "motion", "ego_motion")}
+        dtypes = {name: archive[name].dtype for name in ("flow", "motion", "object", "ego_motion")}
     assert found["config"][1] == found["stats"][1] == "U"
     assert found["valid"][1] == found["in_graph"][1] == found["is_dynamic"][1] == "b"
     assert {name: shape for name, (shape, _) in found.items()} == {
         "points": (5, 3), "flow": (5, 3), "motion": (5, 7), "valid": (5,), "in_graph": (5,),
-        "is_dynamic": (5,), "ego_motion": (4, 4), "config": (), "stats": ()}
-    assert dtypes == {"flow": np.float32, "motion": np.float32, "ego_motion": np.float64}
+        "is_dynamic": (5,), "object": (5,), "ego_motion": (4, 4), "config": (), "stats": ()}
+    assert dtypes == {"flow": np.float32, "motion": np.float32, "object": np.int32, "ego_motion": np.float64}
+
+
+def test_points_are_on_no_object_where_none_are_given(tmp_path):
+    points, result = some_result()
+    io.save_flow(tmp_path / "a.npz", points, replace(result, object_id=None), Config())
+    assert (io.load_flow(tmp_path / "a.npz").object_id == -1).all()
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path, monkeypatch):
@@ -103,6 +111,8 @@ def test_points_and_result_must_match(tmp_path):
 
 @pytest.mark.parametrize("changes, found", [
     ({"flow": None, "stats": None}, "not a flow file, lacks flow, stats"),
+    ({"object": None}, "not a flow file, lacks object"),
+    ({"object": np.zeros(5)}, "'object' is (5,) of float64"),
     ({"flow": np.zeros((5, 2), np.float32)}, "'flow' is (5, 2)"),
     ({"flow": np.float32(3)}, "is () of float32"),
     ({"motion": np.zeros((4, 7), np.float32)}, "'motion' is (4, 7) of float32; expected (5, 7)"),
@@ -147,6 +157,17 @@ def test_poses_in_both_formats(tmp_path):
     assert lines[1].startswith("1317042145.951199337 10 1 2 0 0 ") and lines[2].startswith("0.000000005 ")
     rows = np.array([line.split()[1:] for line in lines], float)
     np.testing.assert_allclose(pose.from_translation_quaternion(rows), world_from_sensor, atol=1e-9)
+
+
+def test_objects_are_a_table(tmp_path):
+    header = "frame,id,points,x,y,z,length,width,height,yaw,vx,vy,vz,speed_m_per_s\n"
+    io.write_objects(tmp_path / "none.csv", [])
+    assert (tmp_path / "none.csv").read_bytes().decode() == header
+    row = ("a,b", 3, 120, *np.array([10.00004, -2, -0.00001, 4.5, 2, 1.5]), np.pi / 2, 3, 4.0, 0, 5)
+    io.write_objects(tmp_path / "o.csv", [row, ("000001", 0, 9, *range(11))])
+    assert (tmp_path / "o.csv").read_bytes().decode().removeprefix(header).splitlines() == [
+        '"a,b",3,120,10.0000,-2.0000,0.0000,4.5000,2.0000,1.5000,1.5708,3.0000,4.0000,0.0000,5.0000',
+        "000001,0,9," + ",".join(f"{k}.0000" for k in range(11))]
 
 
 def test_json_has_no_nan(tmp_path):
@@ -202,7 +223,7 @@ def test_a_run_folder_is_made_and_used_again(tmp_path):
     run = io.new_run_folder(tmp_path / "runs" / "a")
     assert (run / "flow").is_dir() and io.new_run_folder(run) == run, "a run cut short may be repeated"
     io.write_toml(run / "config.toml", Config())
-    for name in ("flow/000007.npz", "metrics.json", "notes.txt"):
+    for name in ("flow/000007.npz", "metrics.json", "objects.csv", "notes.txt"):
         (run / name).write_text("old")
     io.new_run_folder(run)
     assert sorted(entry.name for entry in run.iterdir()) == ["config.toml", "flow", "notes.txt"]

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from shared_data import SHARED, needs_shared
 
 from lidarflow import pose, synthetic
-from lidarflow.config import Config, EgoConfig
+from lidarflow.config import Config, EgoConfig, ObjectsConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.datasets.clouds import read_points
 from lidarflow.errors import LidarflowError
@@ -17,6 +17,8 @@ from lidarflow.lidar import ego, frontend, preparation, start
 from lidarflow.pipeline import FlowEstimator, estimate_flow
 from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
+# The factor graph by itself, over all points, as in the paper; tests/test_objects.py tests the defaults.
+GRAPH_ALONE = replace(Config(), objects=ObjectsConfig(enabled=False))
 SENSOR = synthetic.hdl64e(columns=900)
 COARSE = synthetic.hdl64e(columns=450)
 
@@ -57,7 +59,7 @@ def assert_valid(pair: ScanPair, result: FlowResult) -> None:
 def car():
     """One moving car: pair, truth, result."""
     pair, truth = pair_of(synthetic.one_car(8.0, rng(0)), SENSOR, 1)
-    return pair, truth, estimate_flow(pair)
+    return pair, truth, estimate_flow(pair, GRAPH_ALONE)
 
 
 def test_the_motion_of_one_car_is_found(car):
@@ -95,7 +97,8 @@ def test_matches_and_stats_are_those_of_the_graph(car):
     assert all(row.tobytes() in target for row in result.match_target)
     assert stats.plain_final_error < stats.plain_initial_error
     assert stats.robust_final_error <= stats.robust_initial_error
-    assert {"features", "ego-motion", "mesh", "matching", "solver", "dense answer"} == set(result.seconds)
+    stages = {"features", "ego-motion", "mesh", "matching", "objects", "solver", "dense answer"}
+    assert stages == set(result.seconds)
 
 
 def test_nan_rows_stay_where_they_are(car):
@@ -104,7 +107,7 @@ def test_nan_rows_stay_where_they_are(car):
     target_before = np.unique(rng(3).integers(0, len(pair.target), 200))
     holed = ScanPair(worlds.with_nan_rows(pair.source, before),
                      worlds.with_nan_rows(pair.target, target_before))
-    again = estimate_flow(holed)
+    again = estimate_flow(holed, GRAPH_ALONE)
     assert_valid(holed, again)
     is_hole = np.isnan(holed.source.points).all(axis=1)
     assert is_hole.sum() == len(before)
@@ -119,7 +122,7 @@ def test_nan_rows_stay_where_they_are(car):
 @pytest.mark.slow
 def test_nothing_moves_in_a_room():
     pair, truth = pair_of(synthetic.room(rng(0)), synthetic.hdl64e(columns=700), 1)
-    result = estimate_flow(pair)
+    result = estimate_flow(pair, GRAPH_ALONE)
     assert_valid(pair, result)
     assert_same_motion(result.ego_motion, truth.ego_motion, 0.03, 0.1)
     graph = result.in_graph & result.valid
@@ -131,7 +134,7 @@ def test_nothing_moves_in_a_room():
 @pytest.mark.slow
 def test_the_street_moves_where_it_should():
     pair, truth = pair_of(synthetic.street(rng(0)), SENSOR, 1)
-    result = estimate_flow(pair)
+    result = estimate_flow(pair, GRAPH_ALONE)
     assert_valid(pair, result)
     assert_same_motion(result.ego_motion, truth.ego_motion, 0.03, 0.1)
     error_m, graph, moves = flow_error_m(result, truth), result.in_graph & result.valid, truth.is_dynamic
@@ -144,7 +147,7 @@ def test_the_street_moves_where_it_should():
 def test_identical_scans_do_not_flow():
     pair, _ = pair_of(synthetic.one_car(8.0, rng(1)), COARSE, 2)
     same = ScanPair(pair.source, Scan(pair.source.points.copy(), 100_000_000, "again"))
-    result = estimate_flow(same)
+    result = estimate_flow(same, GRAPH_ALONE)
     assert_valid(same, result)
     assert result.in_graph.sum() > 3000
     assert np.linalg.norm(result.flow, axis=1).max() <= 0.01
@@ -153,7 +156,7 @@ def test_identical_scans_do_not_flow():
 
 def test_swapping_the_scans_inverts_the_motion(car):
     pair, _, there = car
-    back = estimate_flow(worlds.swap(pair))
+    back = estimate_flow(worlds.swap(pair), GRAPH_ALONE)
     assert_same_motion(there.ego_motion, pose.inverse(back.ego_motion), 0.03, 0.1)
     there_m = np.median(there.residual_flow(pair.source.points)[there.is_dynamic], axis=0)
     back_m = np.median(back.residual_flow(pair.target.points)[back.is_dynamic], axis=0)
@@ -184,7 +187,7 @@ def _estimated(scans: list[Scan], registered: list[np.ndarray] | None = None):
         if registered is not None:
             given = iter(registered)
             patch.setattr(ego, "register", lambda *args: next(given))
-        estimator = FlowEstimator()
+        estimator = FlowEstimator(GRAPH_ALONE)
         return [estimator.step(scan) for scan in scans], starts
 
 
@@ -227,7 +230,7 @@ def test_two_runs_give_the_same_bytes(drive):
 
 def test_a_sequence_agrees_with_pairs(drive):
     scans, _, results, _ = drive
-    alone = estimate_flow(ScanPair(scans[0], scans[1]))
+    alone = estimate_flow(ScanPair(scans[0], scans[1]), GRAPH_ALONE)
     assert_same_motion(results[1].ego_motion, alone.ego_motion, 0.01, 0.03)
     graph = results[1].in_graph & results[1].valid & alone.valid
     off_m = np.linalg.norm(results[1].flow - alone.flow, axis=1)
@@ -236,7 +239,7 @@ def test_a_sequence_agrees_with_pairs(drive):
 
 def test_a_sequence_goes_on_after_a_bad_scan(drive):
     scans, *_ = drive
-    estimator = FlowEstimator(replace(Config(), ego=EgoConfig(method="registration")))
+    estimator = FlowEstimator(replace(GRAPH_ALONE, ego=EgoConfig(method="registration")))
     empty = Scan(np.empty((0, 3)), 0, "empty")
     for scan in (scans[0], scans[1], empty, scans[2]):
         try:
@@ -256,7 +259,7 @@ def one_line(error: LidarflowError) -> str:
 
 def test_a_bare_floor_has_no_graph():
     pair = worlds.plane_pair(rng(4))
-    result = estimate_flow(pair)
+    result = estimate_flow(pair, GRAPH_ALONE)
     assert_valid(pair, result)
     assert not result.in_graph.any() and not result.is_dynamic.any()
     assert np.abs(result.flow[:, 2]).max() < 0.1   # along the floor nothing is known, across it all is
@@ -265,21 +268,22 @@ def test_a_bare_floor_has_no_graph():
 def test_a_bare_wall_stays_on_its_plane():
     points = rng(5).uniform([-5.0, 8.0, -1.0], [5.0, 8.0001, 3.0], (3000, 3))
     pair = ScanPair(Scan(points), Scan(points + [0.0, 0.1, 0.0], 100_000_000))
-    result = estimate_flow(pair)
+    result = estimate_flow(pair, GRAPH_ALONE)
     assert_valid(pair, result)
     assert_allclose(result.flow[:, 1], 0.1, atol=0.01)
     assert not result.is_dynamic.any()
 
 
 @pytest.mark.parametrize(("source_rows", "target_rows", "text"), [
-    (10, 10, "registration needs 30"), (4000, 10, "registration needs 30"), (10, 4000, "registration needs 30"),
+    (10, 10, "registration needs 30"), (4000, 10, "registration needs 30"),
+    (10, 4000, "registration needs 30"),
     (0, 4000, "none of 0 points"), (4000, 0, "none of 0 points")])
 def test_too_few_points_are_one_clear_line(source_rows, target_rows, text):
     pair = worlds.plane_pair(rng(6))
     cut = ScanPair(replace(pair.source, points=pair.source.points[:source_rows]),
                    replace(pair.target, points=pair.target.points[:target_rows]))
     with pytest.raises(LidarflowError) as caught:
-        estimate_flow(cut)
+        estimate_flow(cut, GRAPH_ALONE)
     assert text in one_line(caught.value)
 
 
@@ -289,7 +293,7 @@ def test_two_different_sensors_of_one_place():
     source, truth = synthetic.scan_sequence(scene, COARSE, 2, rng(2))[0]
     target, _ = synthetic.scan_sequence(scene, other, 2, rng(3))[1]
     pair = ScanPair(source, target)
-    result = estimate_flow(pair)
+    result = estimate_flow(pair, GRAPH_ALONE)
     assert_valid(pair, result)
     assert_same_motion(result.ego_motion, truth.ego_motion, 0.05, 0.2)
     graph = result.in_graph & result.valid & ~truth.is_dynamic
@@ -303,7 +307,7 @@ def test_two_different_sensors_of_one_place():
 def test_tracked_kitti_drive():
     dataset = open_dataset(SHARED / "kitti_tracked_0005_from_000")
     pair, truth = ScanPair(dataset.scan(0), dataset.scan(1)), dataset.truth(0)
-    result = estimate_flow(pair)
+    result = estimate_flow(pair, GRAPH_ALONE)
     assert_valid(pair, result)
     assert_same_motion(result.ego_motion, truth.ego_motion, 0.03, 0.1)
     error_m, graph = flow_error_m(result, truth), result.in_graph & result.valid & truth.valid

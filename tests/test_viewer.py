@@ -8,7 +8,7 @@ import rerun as rr
 
 from lidarflow import pose, viewer
 from lidarflow.errors import DataError, InstallError
-from lidarflow.types import FlowResult, Scan, ScanPair, SolveStats
+from lidarflow.types import FlowResult, MovingObject, Scan, ScanPair, SolveStats
 
 
 def drive(count=2, points_n=400):
@@ -47,6 +47,28 @@ def record(path, **options):
     viewer.close(stream)
 
 
+def with_object(pair, result):
+    """The result with its twenty moving points as an object that a turned sensor sees go."""
+    ego_motion = pose.from_yaw(np.pi / 2, (-0.5, 0, 0))
+    turned = replace(result, ego_motion=ego_motion)
+    size, centre = np.array([4.0, 2.0, 1.5]), np.array([8.0, 0.0, 0.0])
+    velocity = np.array([-6.0, 0.0, 0.0])       # +y in the source's axes
+    motion = pose.from_translation(velocity * pair.dt_s) @ ego_motion
+    found = MovingObject(3, motion, velocity, centre, size, np.pi / 2, 20)
+    object_id = np.where(result.is_dynamic, 3, -1).astype(np.int32)
+    return replace(turned, objects=(found,), object_id=object_id)
+
+
+class Logged:
+    """A stream that keeps what is logged, entity by entity."""
+
+    def __init__(self):
+        self.by_entity = {}
+
+    def log(self, entity, what, **_):
+        self.by_entity[entity] = what
+
+
 def printed(path, *options) -> str:
     command = [sys.executable, "-m", "rerun", "rrd", *options, str(path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
@@ -66,6 +88,37 @@ def test_a_recording_is_valid_and_holds_every_entity_and_its_blueprint(tmp_path)
     assert f" /{viewer.TOTAL_ARROWS} " not in text
     assert "ViewBlueprint" in text and "EyeControls3D" in text
     assert "Transform3D" in text
+
+
+def test_moving_objects_are_boxes_and_arrows(tmp_path):
+    pair, result = next(drive())
+    stream = viewer.open_recording(tmp_path / "objects.rrd")
+    viewer.log_pair(stream, 0, pair, with_object(pair, result), None, pose.identity())
+    viewer.log_pair(stream, 1, pair, result, None, pose.identity())
+    viewer.close(stream)
+    printed(tmp_path / "objects.rrd", "verify")
+    text = printed(tmp_path / "objects.rrd", "print", "-vvv")
+    assert "/world/source/objects " in text and "id 3: 6.0 m/s" in text and "Boxes3D" in text
+    assert f" /{viewer.OBJECT_ARROWS} " in text
+
+
+def test_boxes_and_arrows_of_objects_are_in_the_sources_axes():
+    pair, result = next(drive())
+    logged = Logged()
+    viewer._log_boxes(logged, with_object(pair, result))
+    viewer._log_arrows_of_objects(logged, with_object(pair, result))
+    boxes, arrows = logged.by_entity[viewer.OBJECTS], logged.by_entity[viewer.OBJECT_ARROWS]
+
+    def values(batch):
+        return np.array(batch.as_arrow_array().to_pylist())
+
+    np.testing.assert_allclose(values(boxes.centers), [[8, 0, 0]])
+    np.testing.assert_allclose(values(boxes.half_sizes), [[2, 1, 0.75]])
+    np.testing.assert_allclose(values(boxes.quaternions), [[0, 0, 0.5**0.5, 0.5**0.5]], atol=1e-6)
+    np.testing.assert_allclose(values(arrows.origins), [[8, 0, 0.75]])
+    np.testing.assert_allclose(values(arrows.vectors), [[0, 6, 0]], atol=1e-6)
+    viewer._log_boxes(logged, result)
+    assert len(values(logged.by_entity[viewer.OBJECTS].centers)) == 0, "those of the frame before are gone"
 
 
 def test_a_scan_without_any_motion_or_match_or_crispness_can_be_logged(tmp_path):
