@@ -221,7 +221,7 @@ def _process(
 
         reports = runner.process(dataset, frames, settings, out, viewing, on_pair)
     print()
-    _print(run_table(reports))
+    _print(run_table(reports, settings))
     print()
     for note in run_notes(reports, settings):
         print(note)

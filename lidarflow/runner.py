@@ -37,6 +37,8 @@ class PairReport:
     points: int
     graph_points: int
     moving_points: int
+    objects: int
+    matches: int
     alignment: metrics.Alignment
     scores: metrics.Scores | None
     truth: str
@@ -132,6 +134,7 @@ def figures_of(report: PairReport) -> dict[str, float]:
         "crispness_by_ego": report.alignment.by_ego,
         "crispness_after": report.alignment.after,
         "moving_points": float(report.moving_points),
+        "objects": float(report.objects),
     }
     if report.scores is not None:
         s = report.scores
@@ -168,6 +171,8 @@ def report_pair(
         points=len(pair.source),
         graph_points=int((result.in_graph & result.valid).sum()),
         moving_points=int(result.is_dynamic.sum()),
+        objects=len(result.objects),
+        matches=len(result.match_source),
         alignment=metrics.alignment(pair.source, pair.target, result, config.crispness.sigma_m),
         scores=None if truth is None else metrics.score(pair.source.points, result, truth),
         truth=origin,

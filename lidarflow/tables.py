@@ -15,18 +15,24 @@ _COLUMNS = {
     "graph_epe_static_m": "graph\nstatic\n[m]", "graph_epe_dynamic_m": "graph\nmoving\n[m]",
     "movers_found": "movers\nfound\n[%]", "false_movers": "false\nmovers\n[%]",
     "crispness_before": "crisp\nbefore", "crispness_after": "crisp\nafter",
-    "moving_points": "moving\npoints",
+    "moving_points": "moving\npoints", "objects": "moving\nobjects",
 }
+_COUNTS = {"moving_points", "objects"}
 _SHARES = {"movers_found", "false_movers"}
 _POOR_CRISPNESS = 0.5
 _ODD_SIZE_RATIO = 2.0
 _DEFAULT_CHARS = 12
 
 
-def run_table(reports: list[PairReport]) -> Table:
-    """One row per pair and their mean, 80 characters wide; columns without a value anywhere are left out."""
+def run_table(reports: list[PairReport], config: Config) -> Table:
+    """One row per pair and their mean, 80 characters wide; columns without a value anywhere are left out.
+
+    Columns of the graph are for a graph of all points; of objects, where they are looked for.
+    """
     rows = [figures_of(report) for report in reports]
-    shown = [name for name in _COLUMNS if any(np.isfinite(row.get(name, np.nan)) for row in rows)]
+    columns = [name for name in _COLUMNS if name != "objects" or config.objects.enabled]
+    columns = [name for name in columns if not (name.startswith("graph") and config.objects.enabled)]
+    shown = [name for name in columns if any(np.isfinite(row.get(name, np.nan)) for row in rows)]
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, pad_edge=False)
     table.add_column("scan", overflow="fold")
     for name in shown:
@@ -44,22 +50,22 @@ def run_table(reports: list[PairReport]) -> Table:
 
 def run_notes(reports: list[PairReport], config: Config) -> list[str]:
     """What the figures of `run_table` mean, and which pairs look wrong."""
-    notes = [f"crisp: crispness with σ = {config.crispness.sigma_m:g} m, 1 = aligned, of the graph's points"]
+    notes = [f"crisp: crispness with σ = {config.crispness.sigma_m:g} m, 1 = aligned, of points above ground"]
     if reports[0].scores is None:
         notes.insert(0, "truth: none found")
     else:
-        notes = [f"truth: {reports[0].truth}", "EPE: mean end-point error of all points",
-                 "graph: the same of the points the graph solved; others have the ego-motion",
-                 *notes]
+        graph = [] if config.objects.enabled else [
+            "graph: the same of the points the graph solved; others have the ego-motion"]
+        notes = [f"truth: {reports[0].truth}", "EPE: mean end-point error of all points", *graph, *notes]
     for report in reports:
-        doubt = _doubt(report.graph_points, report.alignment)
+        doubt = _doubt(report.matches, report.alignment)
         notes += [f"{report.frame}: {doubt}"] if doubt else []
     return notes
 
 
-def _doubt(graph_points: int, alignment: Alignment) -> str:
+def _doubt(matches: int, alignment: Alignment) -> str:
     """What makes a result doubtful, "" for nothing."""
-    if graph_points == 0:
+    if matches == 0:
         return "no point found a match, so all of them have the ego-motion"
     if alignment.after < _POOR_CRISPNESS:
         return (f"crispness is only {alignment.after:.3f} after the flow; are these consecutive scans of one "
@@ -70,7 +76,7 @@ def _doubt(graph_points: int, alignment: Alignment) -> str:
 def _text(name: str, value: float | None) -> str:
     if value is None or not np.isfinite(value):
         return "-"
-    if name == "moving_points":
+    if name in _COUNTS:
         return f"{value:.0f}"
     return f"{100 * value:.2f}" if name in _SHARES else f"{value:.3f}"
 
@@ -85,16 +91,20 @@ def pair_table(pair: ScanPair, result: FlowResult, alignment: Alignment) -> Tabl
     graph = result.in_graph & result.valid
     table.add_row("points", f"{len(pair.source)}, {graph.sum()} of them solved by the graph, "
                             f"{result.is_dynamic.sum()} moving by themselves")
+    for found in result.objects:
+        x_m, y_m, _ = found.box_centre
+        table.add_row(f"object {found.id}", f"{found.points} points at x {x_m:.1f} y {y_m:.1f} m, "
+                                            f"{np.linalg.norm(found.velocity):.1f} m/s")
     table.add_row("ego-motion", f"translation {x:.3f} {y:.3f} {z:.3f} m, rotation {turn_deg:.2f} deg, "
                                 "target_from_source")
-    if graph.any():
+    if np.isfinite(alignment.after):
         table.add_row("crispness", f"{alignment.before:.3f} before, {alignment.by_ego:.3f} by ego-motion, "
                                    f"{alignment.after:.3f} by the flow (σ = {alignment.sigma_m:g} m)")
     counts = len(pair.source), len(pair.target)
     odd_sizes = max(counts) > _ODD_SIZE_RATIO * min(counts)
     if odd_sizes:
         table.add_row("note", f"the scans have {counts[0]} and {counts[1]} points; are both of one sensor?")
-    doubt = _doubt(int(graph.sum()), alignment)
+    doubt = _doubt(len(result.match_source), alignment)
     if doubt:
         table.add_row("note", doubt)
     table.add_row("seconds", ", ".join(f"{stage} {s:.1f}" for stage, s in result.seconds.items()))

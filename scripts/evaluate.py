@@ -25,8 +25,9 @@ SCORES = {
     "t_e_m": "t_e [m]", "r_e_rad": "r_e [rad]", "ego_error_m": "ego [m]", "ego_error_deg": "ego [deg]",
     "movers_found": "movers found", "false_movers": "false movers",
     "crispness_before": "crispness before", "crispness_by_ego": "by ego-motion",
-    "crispness_after": "after",
+    "crispness_after": "after", "objects": "objects",
 }
+OF_THE_GRAPH = ("graph", "t_e", "r_e")   # scores that mean something for a graph of all points only
 
 
 def evaluate(job: tuple[Path, int | None, settings.Config]) -> dict:
@@ -63,14 +64,16 @@ def number(value: float | None) -> str:
     return "-" if value is None or not np.isfinite(value) else f"{value:.3f}"
 
 
-def score_table(found: list[dict]) -> str:
-    """Scores, one column per folder."""
+def score_table(found: list[dict], config: settings.Config) -> str:
+    """Scores, one column per folder; those of the graph only where it holds all points."""
     rows = [["truth", *(f["truth"].partition(" ")[0] for f in found)],
             ["pairs", *(str(f["pairs"]) for f in found)],
             ["points", *(f"{f['points']:.0f}" for f in found)],
             ["graph points", *(f"{f['graph_points']:.0f}" for f in found)]]
     for name, title in SCORES.items():
         values = [f["scores"].get(name) for f in found]
+        if config.objects.enabled and name.startswith(OF_THE_GRAPH):
+            continue
         if any(value is not None for value in values):
             digits = (lambda v: "-" if v is None else f"{100 * v:.2f} %") if "movers" in name else number
             rows.append([title, *(digits(value) for value in values)])
@@ -100,7 +103,7 @@ def main() -> None:
     jobs = [(folder, options.n_scans, config) for folder in options.folders]
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         found = list(pool.imap(evaluate, jobs))
-    print(score_table(found), "\n")
+    print(score_table(found, config), "\n")
     print(time_table(found))
     if options.json:
         options.json.write_text(json.dumps(found, indent=2) + "\n")

@@ -251,18 +251,24 @@ def test_a_run_says_what_it_read_and_wrote_within_80_columns(finished):
         assert word in done.stdout
 
 
-def test_the_widest_table_fits_80_columns(monkeypatch, capsys):
-    """Ten columns, with the names and figures of a long drive."""
+OVERRIDES = {True: (), False: ("objects.enabled=false",)}
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_widest_table_fits_80_columns(monkeypatch, capsys, enabled):
+    """Up to ten columns, with the names and figures of a long drive; the graph's only without objects."""
     alignment = metrics.Alignment(0.741, 0.9, 0.969, 0.2)
     summary = metrics.ErrorSummary(100, 12.345, 1.2)
     scores = metrics.Scores(*[summary] * 5, 0.1, 0.1, 1.0, 1.0, 0.1, 0.1)
-    reports = [runner.PairReport(name, 123456, 5000, 123456, alignment, scores, "flow", None, {"all": 999.9})
+    reports = [runner.PairReport(name, 123456, 5000, 123456, 42, 999, alignment, scores, "flow", None,
+                                 {"all": 999.9})
                for name in ("0000000000", "315966265259836000")]
     monkeypatch.setenv("COLUMNS", "80")
-    cli._print(tables.run_table(reports))
+    cli._print(tables.run_table(reports, config.load(overrides=OVERRIDES[enabled])))
     out = capsys.readouterr().out
     assert fits_80_columns(out) and "0000000000 " in out
-    assert out.count("12.345") == 12 and out.count("999.9") == 3
+    assert out.count("12.345") == (6 if enabled else 12) and out.count("999.9") == 3
+    assert out.count(" 42") == (3 if enabled else 0)
     assert "".join(line.split()[0] for line in out.splitlines() if line.startswith(("315", "836"))).isdigit()
 
 
