@@ -24,6 +24,7 @@ _REACH_M = 0.7           # a body grows by this much at a time
 _GROWTH_ROUNDS = 4
 _VOTE_CELL_M = 0.2
 _MAX_VOTERS = 150
+_MAX_START_POINTS = 300  # as many choose the start; the fit that follows uses all
 _MATCH_MODE_M = 0.15
 _MIN_FOLLOWERS = 0.3     # share of a body's matches that must follow its motion
 _CLEARLY_BETTER_M = 0.02
@@ -85,14 +86,13 @@ def find(view: View, dt_s: float, config: ObjectsConfig) -> list[Body]:
     """The moving objects of a view; no point belongs to two, and the best supported come first."""
     seeds = _seeds(view)
     label = clusters.linked(view.points[seeds], _SEED_LINK_M)
-    neighbourhood = cKDTree(view.points)
     bodies, taken = [], np.zeros(len(view.points), bool)
     for cluster in np.argsort(-np.bincount(label), kind="stable") if len(label) else ():
         seed = seeds[label == cluster]
         seed = seed[~taken[seed]]
         if len(seed) < config.min_points:
             continue
-        body = _grown(view, neighbourhood, seed, _best_start(view, seed), config)
+        body = _grown(view, seed, _best_start(view, seed), config)
         if body is None or not _moves(view, body, dt_s, config):
             continue
         rows = body.rows[~taken[body.rows]]
@@ -129,7 +129,7 @@ def _seeds(view: View) -> np.ndarray:
 
 def _best_start(view: View, seed: np.ndarray) -> np.ndarray:
     """Motion (4, 4) of the seed points with the smallest misfit among matches' and votes' translations."""
-    points = view.points[seed]
+    points = _spread(view.points[seed], _MAX_START_POINTS)
     fits = [rigid_fit.onto(points, view.upright, shift)
             for shift in [*_match_translations(view, points), *_voted_translations(view, points)]]
     fits = fits or [np.eye(4)]
@@ -184,7 +184,7 @@ def _spread(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def _grown(
-    view: View, neighbourhood: cKDTree, seed: np.ndarray, over_ground: np.ndarray, config: ObjectsConfig
+    view: View, seed: np.ndarray, over_ground: np.ndarray, config: ObjectsConfig
 ) -> Body | None:
     """The body around a seed: what hangs together with it and agrees with its motion; None if too small.
 
@@ -192,7 +192,7 @@ def _grown(
     the car's motion explains it about as well.
     """
     range_m = np.linalg.norm(view.points, axis=1)
-    near = _around(neighbourhood, view.points[seed], 1.0)
+    near = _around(view.points, view.points[seed], 1.0)
     body = None
     for _ in range(_GROWTH_ROUNDS):
         by_own = _left(view.target, pose.apply(over_ground, view.points[near]))
@@ -209,16 +209,19 @@ def _grown(
         shift = (pose.apply(over_ground, view.points[rows]) - view.points[rows]).mean(axis=0)
         over_ground = rigid_fit.onto(view.points[rows], view.upright, shift)
         body = Body(rows, over_ground)
-        wider = np.union1d(near, _around(neighbourhood, view.points[rows[::3]], _REACH_M))
+        wider = np.union1d(near, _around(view.points, view.points[rows], _REACH_M))
         if len(wider) == len(near):
             break
         near = wider
     return body
 
 
-def _around(tree: cKDTree, points: np.ndarray, radius_m: float) -> np.ndarray:
-    """Sorted rows of `tree` within `radius_m` of any of the points (N, 3)."""
-    return np.unique(np.concatenate(tree.query_ball_point(points, radius_m)).astype(np.int64))
+def _around(points: np.ndarray, body: np.ndarray, radius_m: float) -> np.ndarray:
+    """Sorted rows of points (N, 3) within `radius_m` of any of the points of `body` (K, 3)."""
+    low, high = body.min(axis=0) - radius_m, body.max(axis=0) + radius_m
+    rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    distance_m, _ = cKDTree(body).query(points[rows], distance_upper_bound=radius_m, workers=-1)
+    return rows[np.isfinite(distance_m)]
 
 
 def _moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:

@@ -10,6 +10,7 @@ _ROUNDS_PER_GATE = 5
 _MAX_TURN_RAD = 0.15
 _MIN_TURNING_POINTS = 16     # fewer points do not fix a turn
 _MIN_POINTS = 4
+_SETTLED = 1e-4              # a round that changes less, in metres and radians, ends its gate
 
 
 def onto(points: np.ndarray, target: cKDTree, translation: np.ndarray) -> np.ndarray:
@@ -26,7 +27,10 @@ def onto(points: np.ndarray, target: cKDTree, translation: np.ndarray) -> np.nda
             paired = np.isfinite(distance_m)
             if paired.sum() < _MIN_POINTS:
                 break
+            before = turn, shift
             turn, shift = _best(points[paired] - centre, target.data[nearest[paired]] - centre)
+            if abs(turn - before[0]) < _SETTLED and np.abs(shift - before[1]).max() < _SETTLED:
+                break
     return _about(centre, turn, shift)
 
 
