@@ -15,11 +15,18 @@ def crispness(points: np.ndarray, target: np.ndarray, sigma_m: float) -> float:
     d reaches from each point to the nearest target point and Σ = sigma_m² I (Dewan et al. 2016, eq. 15;
     scores of different sigma cannot be compared). NaN without points.
     """
+    return _crispness(points, _tree(target), sigma_m)
+
+
+def _tree(points: np.ndarray) -> cKDTree:
+    return cKDTree(points[np.isfinite(points).all(axis=1)])
+
+
+def _crispness(points: np.ndarray, target: cKDTree, sigma_m: float) -> float:
     points = points[np.isfinite(points).all(axis=1)]
-    target = target[np.isfinite(target).all(axis=1)]
-    if len(points) == 0 or len(target) == 0:
+    if len(points) == 0 or target.n == 0:
         return float("nan")
-    distance_m, _ = cKDTree(target).query(points, workers=-1)
+    distance_m, _ = target.query(points, workers=-1)
     return float(np.exp(-(distance_m**2) / (4.0 * sigma_m**2)).mean())
 
 
@@ -36,11 +43,11 @@ class Alignment:
 def alignment(source: Scan, target: Scan, result: FlowResult, sigma_m: float) -> Alignment:
     """Crispness of the points above ground whose motion is known."""
     rows = result.valid & ~result.is_ground
-    points = source.points[rows]
+    points, tree = source.points[rows], _tree(target.points)
     return Alignment(
-        before=crispness(points, target.points, sigma_m),
-        by_ego=crispness(pose.apply(result.ego_motion, points), target.points, sigma_m),
-        after=crispness(points + result.flow[rows], target.points, sigma_m),
+        before=_crispness(points, tree, sigma_m),
+        by_ego=_crispness(pose.apply(result.ego_motion, points), tree, sigma_m),
+        after=_crispness(points + result.flow[rows], tree, sigma_m),
         sigma_m=sigma_m,
     )
 

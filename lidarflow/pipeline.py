@@ -176,8 +176,7 @@ def _find_objects(
 
 def _require_points(scan: Scan, config: Config) -> None:
     limits = config.preparation
-    left = len(_finite_in_range(scan, config))
-    if left == 0:
+    if not preparation.usable(scan.points, limits).any():
         raise DataError(
             f"{scan.name}: none of {len(scan)} points lies between {limits.min_range_m:g} and "
             f"{limits.max_range_m:g} m from the sensor; is the scan empty, or not in metres?")

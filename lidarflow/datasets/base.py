@@ -74,6 +74,13 @@ class ScanFiles:
         """Nothing is known unless a loader says otherwise."""
         return None
 
+    def stored_truth(self, folder: Path, index: int) -> Truth | None:
+        """Truth of <scan>.npz in `folder`, where there is such a file and the scan has a successor."""
+        if not 0 <= index < len(self) - 1:
+            return None
+        file = folder / f"{self.files[index].stem}.npz"
+        return load_truth(file, self.files[index], self.files[index + 1])
+
     def world_from_sensor(self) -> np.ndarray | None:
         """No poses unless a loader says otherwise."""
         return None

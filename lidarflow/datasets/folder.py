@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow.datasets import clouds, tables
-from lidarflow.datasets.base import ScanFiles, load_truth
+from lidarflow.datasets.base import ScanFiles
 from lidarflow.datasets.kitti_correction import is_wanted
 from lidarflow.errors import DataError
 from lidarflow.types import Truth
@@ -63,10 +63,7 @@ class KittiRaw(ScanFiles):
 
     def truth(self, index: int) -> Truth | None:
         """Truth of truth/<scan>.npz where there is such a file."""
-        if not 0 <= index < len(self) - 1:
-            return None
-        file = self.folder / "truth" / f"{self.files[index].stem}.npz"
-        return load_truth(file, self.files[index], self.files[index + 1])
+        return self.stored_truth(self.folder / "truth", index)
 
     def world_from_sensor(self) -> np.ndarray | None:
         """Given poses (N, 4, 4), where a file beside the scan folder holds them."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.datasets import clouds, tables
-from lidarflow.datasets.base import ScanFiles, load_truth
+from lidarflow.datasets.base import ScanFiles
 from lidarflow.datasets.folder import folder_name
 from lidarflow.datasets.kitti_correction import is_wanted
 from lidarflow.errors import DataError
@@ -36,10 +36,7 @@ class KittiOdometry(ScanFiles):
 
     def truth(self, index: int) -> Truth | None:
         """Truth of truth/<scan>.npz where there is such a file."""
-        if not 0 <= index < len(self) - 1:
-            return None
-        file = self.folder / "truth" / f"{self.files[index].stem}.npz"
-        return load_truth(file, self.files[index], self.files[index + 1])
+        return self.stored_truth(self.folder / "truth", index)
 
     def world_from_sensor(self) -> np.ndarray | None:
         """Poses (N, 4, 4) of the LiDAR in the first camera's world, turned into the LiDAR's axes."""

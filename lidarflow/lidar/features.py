@@ -1,4 +1,4 @@
-"""What one scan brings to any pair it is part of: masks, surface, normals, keypoints, descriptors, mesh."""
+"""What one scan brings to any pair it is part of: masks, surface, keypoints, descriptors."""
 
 from dataclasses import dataclass
 

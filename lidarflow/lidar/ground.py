@@ -44,7 +44,7 @@ def estimate_sensor_height(points: np.ndarray) -> float | None:
     those leaves out cells that only show walls.
     """
     near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR_M]
-    lowest, counts, _ = _lowest_per_cell(near)
+    lowest, counts, _ = _low_per_cell(near, 0.0)
     trusted = lowest[counts >= _MIN_CELL_POINTS]
     return float(-np.quantile(trusted, 0.25)) if len(trusted) else None
 
@@ -71,10 +71,7 @@ def _close_to_local_ground(points: np.ndarray, max_height_m: float) -> np.ndarra
 
     A low quantile, not the lowest point, which may be a reflection from under the road.
     """
-    _, counts, cell = _lowest_per_cell(points)
-    order = np.lexsort((points[:, 2], cell))
-    first = np.cumsum(counts) - counts
-    low = points[order[first + (_LOW_SHARE * (counts - 1)).astype(int)], 2]
+    low, _, cell = _low_per_cell(points, _LOW_SHARE)
     slope_allowance_m = 0.1 * _CELL_M
     return points[:, 2] - low[cell] <= max_height_m + slope_allowance_m
 
@@ -100,16 +97,16 @@ def _filled(points: np.ndarray, rows: np.ndarray, ground: np.ndarray, height_m: 
     return filled
 
 
-def _lowest_per_cell(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lowest z and count (C,) of each occupied cell, and the cell (N,) of each point."""
+def _low_per_cell(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """z (C,) at `share` of the way up each cell (0: lowest), counts (C,), and cell (N,) of each point."""
     columns = np.floor(points[:, :2] / _CELL_M).astype(np.int64)
     columns -= columns.min(axis=0) if len(columns) else 0
     stride = columns[:, 1].max() + 1 if len(columns) else 1
     key = columns[:, 0] * stride + columns[:, 1]
     _, cell, counts = np.unique(key, return_inverse=True, return_counts=True)
-    lowest = np.full(len(counts), np.inf)
-    np.minimum.at(lowest, cell, points[:, 2])
-    return lowest, counts, cell
+    order = np.lexsort((points[:, 2], cell))
+    first = np.cumsum(counts) - counts
+    return points[order[first + (share * (counts - 1)).astype(int)], 2], counts, cell
 
 
 def _patchwork(points: np.ndarray) -> np.ndarray:
