@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarflow.kernels import grid, linalg, matching, mesh, normals, shot
+from lidarflow.kernels import coherence, grid, linalg, matching, mesh, normals, shot
 
 RADIUS_M = 1.0
 
@@ -114,6 +114,35 @@ def check_normals(count: int) -> None:
     np.testing.assert_array_equal(np.isnan(estimated), np.isnan(expected))
     assert np.isnan(expected).any() and np.isfinite(expected).all(axis=1).sum() >= 10
     np.testing.assert_allclose(estimated, expected, atol=1e-8)
+
+
+# ---- local shifts ---------------------------------------------------------------------------------------
+
+def local_shifts_twin(points, plane_normals, offsets_m, radius_m):
+    known = np.isfinite(plane_normals).all(axis=1) & np.isfinite(offsets_m)
+    rows = []
+    for point in points:
+        near = known & (np.linalg.norm(points - point, axis=1) <= radius_m)
+        n, r = plane_normals[near], offsets_m[near]
+        if near.any():
+            # Damping as extra rows of the least-squares problem.
+            stacked = np.vstack([n, np.sqrt(0.02 * len(n)) * np.eye(3)])
+            t = np.linalg.lstsq(stacked, np.concatenate([r, np.zeros(3)]), rcond=None)[0]
+            rows.append((t, len(n), np.sqrt((r**2).mean()), np.sqrt(((r - n @ t) ** 2).mean())))
+        else:
+            rows.append((np.zeros(3), 0, 0.0, 0.0))
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+def check_local_shifts(count: int) -> None:
+    random = rng(9)
+    points = bumpy_surface(count, random)
+    planes = normals_twin(points, points, 0.5)
+    offsets_m = (planes * [0.1, -0.05, 0.2]).sum(axis=1) + random.normal(0, 0.01, len(points))
+    offsets_m[::7] = np.nan
+    given = points, planes, offsets_m, 0.5
+    for found, expected in zip(coherence.local_shifts(*given), local_shifts_twin(*given), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 # ---- SHOT -----------------------------------------------------------------------------------------------
@@ -279,6 +308,7 @@ def check_all_tiny() -> None:
     check_grid_queries(40)
     check_eigen(2)
     check_normals(120)
+    check_local_shifts(80)
     check_shot(160, 4)
     check_matching(40)
     check_ring_strips(3, 60)
@@ -304,6 +334,22 @@ def test_normals():
 
 def test_normals_without_any_surface_are_nan():
     assert np.isnan(normals.estimate(np.ones((3, 3)), np.empty((0, 3)), 0.5)).all()
+
+
+def test_local_shifts():
+    check_local_shifts(600)
+
+
+def test_a_bent_surface_tells_its_whole_shift_and_a_plane_the_part_across_it():
+    random = rng(10)
+    bent, shift = random.normal(size=(200, 3)), np.array([0.1, -0.2, 0.05])
+    across = bent / np.linalg.norm(bent, axis=1, keepdims=True)
+    found, count, before_m, after_m = coherence.local_shifts(0.1 * across, across, across @ shift, 1.0)
+    np.testing.assert_allclose(found, np.tile(shift, (200, 1)), atol=0.015)   # damping holds back a little
+    assert (count == 200).all() and (after_m < 0.1 * before_m).all()
+    flat = np.tile([0.0, 0.0, 1.0], (200, 1))
+    found, *_ = coherence.local_shifts(random.uniform(0, 0.3, (200, 3)), flat, np.full(200, 0.2), 1.0)
+    np.testing.assert_allclose(found, np.tile([0.0, 0.0, 0.2], (200, 1)), atol=0.005)
 
 
 def test_shot():
