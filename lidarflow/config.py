@@ -133,13 +133,26 @@ class ObjectsConfig:
     near_share: float = setting(0.006, "and this share of its range more", low=0)
     min_points: int = setting(8, "smaller objects are not looked for", low=4)
     min_speed_m_per_s: float = setting(0.5, "slower objects count as static", low=0)
-    min_matches: int = setting(3, "descriptor matches that must follow an object's motion", low=0)
+    min_matches: int = setting(5, "descriptor matches that an object must have", low=0)
+    min_shift_m: float = setting(
+        0.05, "a surface whose plane distances tell a smaller shift is taken as still", low=0)
+    along_ground: float = setting(
+        1.0, "how strongly objects move along the ground, as a multiple of all their points; 0 = not at all",
+        low=0)
+    max_clearance_m: float = setting(
+        1.5, "what moves stands on the ground: its lowest point is no higher over it", low=0)
     min_unexplained: float = setting(
-        0.1, "share of an object's points that ego-motion must leave unexplained in either scan",
+        0.2, "share of the points that an object's motion should leave unexplained by ego-motion that must "
+        "be so, in either scan", low=0, high=1)
+    min_observability: float = setting(
+        0.1, "mean squared cosine that an object's normals must have with its motion; 0 lets walls slide",
         low=0, high=1)
-    max_misfit_ratio: float = setting(
-        0.15, "an object's own motion must bring its mean squared misfits, that of shape times that of "
-        "matches, down to this share", low=0, high=1)
+    max_shape_ratio: float = setting(
+        0.4, "an object's own motion must bring its mean squared plane distance down to this share",
+        low=0, high=1)
+    max_match_deviation: float = setting(
+        0.6, "how far the median match on an object may be from its motion, as a share of the motion",
+        low=0, high=2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.errors import DataError
 from lidarflow.lidar import dynamic, ego, features, frontend, mesh, objects, preparation, start
+from lidarflow.lidar import view as view_of_pair
 from lidarflow.solve import gtsam_lm
 from lidarflow.types import FlowResult, MovingObject, Scan, ScanPair
 
@@ -155,10 +156,10 @@ def _find_objects(
     at = np.full(len(points), -1)
     at[rows] = np.arange(len(rows))
     matched = at[graph.rows[graph.problem.match_index]]
-    view = objects.look(
+    view = view_of_pair.look(
         pose.apply(ego_motion, points[rows]), pair.target.points[target.usable],
         target.ground[target.usable], pose.apply(ego_motion, points[source.usable]),
-        (matched, graph.problem.match_target), config.objects)
+        (matched, graph.problem.match_target), config.normals.radius_m, config.objects)
     bodies = objects.find(view, pair.dt_s, config.objects)
 
     object_id = np.full(len(points), -1, np.int32)

@@ -32,7 +32,10 @@ def from_translation(translation: np.ndarray) -> np.ndarray:
 
 def from_yaw(yaw: float, translation: np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
     """Motion (4, 4) that turns about z by `yaw` radians, then moves by `translation` metres."""
-    return from_rotation_translation(Rotation.from_euler("z", yaw).as_matrix(), translation)
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    x, y, z = translation
+    return np.array([
+        [cosine, -sine, 0.0, x], [sine, cosine, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])
 
 
 def inverse(motion: np.ndarray) -> np.ndarray:

@@ -23,3 +23,11 @@ def linked(points: np.ndarray, link_m: float) -> np.ndarray:
     pairs = cKDTree(means).query_pairs(link_m, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(counts), len(counts)))
     return connected_components(graph, directed=False)[1][member]
+
+
+def near_rows(points: np.ndarray, body: np.ndarray, radius_m: float) -> np.ndarray:
+    """Ascending rows of points (N, 3) within `radius_m` of any of the points of `body` (K, 3)."""
+    low, high = body.min(axis=0) - radius_m, body.max(axis=0) + radius_m
+    rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    distance_m, _ = cKDTree(body).query(points[rows], distance_upper_bound=radius_m)
+    return rows[np.isfinite(distance_m)]

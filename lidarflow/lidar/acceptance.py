@@ -1,0 +1,114 @@
+"""Does a body move, or does something merely look so?"""
+
+import numpy as np
+
+from lidarflow import pose
+from lidarflow.config import ObjectsConfig
+from lidarflow.lidar.body import Body
+from lidarflow.lidar.clusters import near_rows
+from lidarflow.lidar.evidence import tolerance
+from lidarflow.lidar.surface import CAP_M, misfit
+from lidarflow.lidar.view import View
+
+_GROUND_RADIUS_M = 10.0
+_MIN_GROUND_POINTS = 20
+_OWN_M = 0.7             # what is nearer to a body may be a part of it
+_SURROUNDINGS_M = 3.0
+_MIN_SURROUNDINGS = 100
+_AROUND_M = 0.25   # target points this near to a moved body should be the body's
+
+
+def moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
+    """Whether a body is fast enough, and its shape, its matches and the space it took all say that it moves.
+
+    Each is deceived by something else: distances by leaves that flicker and by places seen anew, planes by
+    walls along which any motion fits, matches by what looks alike.
+    """
+    points = view.points[body.rows]
+    moved = pose.apply(body.over_ground, points)
+    shift = (moved - points).mean(axis=0)
+    if np.hypot(shift[0], shift[1]) < config.min_speed_m_per_s * dt_s:
+        return False
+    return (
+        _clearance(view, points) <= config.max_clearance_m
+        and _shape_ratio(view, body, moved) <= config.max_shape_ratio
+        and not _surroundings_gain(view, body, points)
+        and _observability(view, body, shift / np.linalg.norm(shift)) >= config.min_observability
+        and _matches_agree(view, body, shift, config)
+        and _left_and_arrived(view, body, moved, shift, config))
+
+
+def _clearance(view: View, points: np.ndarray) -> float:
+    """Height of the lowest point over the ground around it; 0 where none is seen."""
+    lowest = points[np.argmin(points[:, 2])]
+    near = view.ground.query_ball_point(lowest, _GROUND_RADIUS_M) if view.ground.n else []
+    if len(near) < _MIN_GROUND_POINTS:
+        return 0.0
+    return float(lowest[2] - np.median(view.ground.data[near][:, 2]))
+
+
+def _shape_ratio(view: View, body: Body, moved: np.ndarray) -> float:
+    """Mean squared plane distance after the body's own motion over that after ego-motion, in both scans.
+
+    Of the source count the body's points where the sensor looked again, of the target those around where the
+    body went, brought back: what fits a few of many points by chance does not fit the other way.
+    """
+    seen = body.rows[~view.evidence.blind[body.rows]]
+    own_sq = (view.after(seen, body.over_ground).plane_m**2).sum()
+    ego_sq = (view.by_ego.plane_m[seen] ** 2).sum()
+
+    around = near_rows(view.upright.points, moved, _AROUND_M)
+    there, normals = view.upright.points[around], view.upright.normals[around]
+    back = pose.inverse(body.over_ground)
+    brought_back = pose.apply(back, there), pose.turn(back, normals)
+    own_sq += (misfit(*brought_back, view.source, view.source_tree).plane_m ** 2).sum()
+    ego_sq += (misfit(there, normals, view.source, view.source_tree).plane_m ** 2).sum()
+    return float(own_sq / ego_sq) if ego_sq > 0 else np.inf
+
+
+def _surroundings_gain(view: View, body: Body, points: np.ndarray) -> bool:
+    """Whether the same motion explains what surrounds the body better too: then the ego-motion is off."""
+    around = np.setdiff1d(
+        near_rows(view.points, points, _SURROUNDINGS_M), near_rows(view.points, points, _OWN_M))
+    if len(around) < _MIN_SURROUNDINGS:
+        return False
+    own_sq = (view.after(around, body.over_ground).plane_m ** 2).sum()
+    return bool(own_sq < (view.by_ego.plane_m[around] ** 2).sum())
+
+
+def _observability(view: View, body: Body, direction: np.ndarray) -> float:
+    """Mean squared cosine between the body's normals and the direction (3,) it moves in.
+
+    A wall explains any motion along itself, so that none is to be believed (the aperture problem).
+    """
+    normals = view.source.normals[body.rows]
+    normals = normals[np.isfinite(normals).all(axis=1)]
+    return float(((normals @ direction) ** 2).mean()) if len(normals) else 0.0
+
+
+def _matches_agree(view: View, body: Body, shift: np.ndarray, config: ObjectsConfig) -> bool:
+    """Whether the body's median descriptor match is nearer to its motion than to rest, along the ground."""
+    on_body = np.isin(view.match_rows, body.rows)
+    if on_body.sum() < max(config.min_matches, 1):
+        return config.min_matches == 0
+    points, match_shift = view.points[view.match_rows[on_body]], view.match_shift[on_body]
+    off = np.median(points + match_shift - pose.apply(body.over_ground, points), axis=0)
+    return np.hypot(off[0], off[1]) <= min(config.max_match_deviation * np.hypot(shift[0], shift[1]), CAP_M)
+
+
+def _left_and_arrived(
+    view: View, body: Body, moved: np.ndarray, shift: np.ndarray, config: ObjectsConfig
+) -> bool:
+    """Whether the body left where it was and arrived where the source, as it stood, had nothing.
+
+    What a newcomer hides seems to have left, but has arrived nowhere new. Only surfaces that the motion
+    shifts by more than explained points may be off can show either.
+    """
+    normals = view.source.normals[body.rows]
+    away_m = np.abs(np.where(np.isfinite(normals), normals, 0.0) @ shift)
+    expected = float((away_m > tolerance(np.linalg.norm(moved, axis=1), config)).mean())
+    left = float(view.evidence.unexplained[body.rows].mean())
+    off_m, nearest = view.upright_tree.query(moved, distance_upper_bound=CAP_M)
+    found = np.isfinite(off_m)
+    arrived = float(view.has_appeared[nearest[found]].mean()) if found.any() else 0.0
+    return min(left, arrived) >= config.min_unexplained * expected

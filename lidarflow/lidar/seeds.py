@@ -1,0 +1,77 @@
+"""Where something may have moved: points that ego-motion leaves behind, or shifts all one way."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidarflow.config import ObjectsConfig
+from lidarflow.kernels import coherence
+from lidarflow.lidar.surface import counterparts
+from lidarflow.lidar.view import View
+
+_NEIGHBOURHOOD_M = 0.5   # evidence is weighed over this neighbourhood
+_LEFT_SHARE = 0.35       # of what could be seen there must be unexplained
+_LEFT_POINTS = 4
+_MIN_PLANES = 8          # so many plane distances tell a shift
+_MIN_COHERENCE = 0.5     # share of their squares that one shift explains
+_MIN_RMS_M = 0.035       # smaller distances are range noise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seeds:
+    """Points to look for objects at.
+
+    rows   (K,) int64   ascending rows of the view's points
+    shift  (K, 3)       the local shift over ground that planes tell, metres; NaN where they tell none
+    """
+
+    rows: np.ndarray
+    shift: np.ndarray
+
+
+def find(view: View, config: ObjectsConfig) -> Seeds:
+    """Unexplained points amid unexplained ones, and points whose surface is shifted as one.
+
+    The first finds what moves by more than the spacing of points, the second what moves by less: on leaves,
+    plane distances point all ways and no shift explains them.
+    """
+    left = _left_behind(view)
+    shifted, shift = _shifted(view, config)
+    rows = np.union1d(left, shifted)
+    shift_of = np.full((len(rows), 3), np.nan)
+    shift_of[np.searchsorted(rows, shifted)] = shift
+    return Seeds(rows, shift_of)
+
+
+def _left_behind(view: View) -> np.ndarray:
+    """Rows of the unexplained points in whose neighbourhood a good share is unexplained."""
+    unexplained = np.flatnonzero(view.evidence.unexplained)
+    if len(unexplained) == 0:
+        return unexplained
+    observable = np.flatnonzero(~view.evidence.blind)
+    points = view.points[unexplained]
+    among_unexplained = _count_around(points, points)
+    among_all = _count_around(view.points[observable], points)
+    return unexplained[(among_unexplained >= _LEFT_POINTS) & (among_unexplained >= _LEFT_SHARE * among_all)]
+
+
+def _count_around(cloud: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return cKDTree(cloud).query_ball_point(points, _NEIGHBOURHOOD_M, return_length=True, workers=-1)
+
+
+def _shifted(view: View, config: ObjectsConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (K,) of thinned points whose neighbourhood is shifted by config.min_shift_m or more, and how."""
+    rows = view.source.thinned
+    points = view.points[rows]
+    row, _, agrees = counterparts(
+        points, view.source.normals[rows], view.upright, view.upright_tree, _NEIGHBOURHOOD_M)
+    planes = np.full((len(rows), 3), np.nan)
+    planes[agrees] = view.upright.normals[row[agrees]]
+    offsets_m = np.full(len(rows), np.nan)
+    offsets_m[agrees] = (planes[agrees] * (view.upright.points[row[agrees]] - points[agrees])).sum(axis=1)
+    shift, count, before_m, after_m = coherence.local_shifts(points, planes, offsets_m, _NEIGHBOURHOOD_M)
+    explained = after_m**2 <= (1.0 - _MIN_COHERENCE) * before_m**2
+    shifted = (count >= _MIN_PLANES) & (before_m >= _MIN_RMS_M) & explained
+    shifted &= np.linalg.norm(shift, axis=1) >= config.min_shift_m
+    return rows[shifted], shift[shifted]
