@@ -36,7 +36,7 @@ LATEST = "latest"
 
 # name: (shape, after N for the arrays with a row per point; dtype kind)
 _ROW_ARRAYS = {"flow": ((3,), "f"), "points": ((3,), "f"), "motion": ((7,), "f"), "valid": ((), "b"),
-               "in_graph": ((), "b"), "is_dynamic": ((), "b"), "object": ((), "i")}
+               "in_graph": ((), "b"), "is_dynamic": ((), "b"), "object": ((), "i"), "std": ((), "f")}
 _WHOLE_ARRAYS = {"ego_motion": ((4, 4), "f"), "config": ((), "U"), "stats": ((), "U")}
 
 
@@ -51,6 +51,7 @@ class FlowFile:
     in_graph    (N,) bool          the motion was solved for
     is_dynamic  (N,) bool          moves over ground by itself
     object_id   (N,) int32         the moving object the point is on, -1 = none
+    std_m       (N,) float32       standard deviation of the flow, metres; NaN = unknown
     ego_motion  (4, 4) float64     target_from_source of the static world
     config      dict               the settings it was made with
     stats       dict               what the solver did
@@ -63,6 +64,7 @@ class FlowFile:
     in_graph: np.ndarray
     is_dynamic: np.ndarray
     object_id: np.ndarray
+    std_m: np.ndarray
     ego_motion: np.ndarray
     config: dict
     stats: dict
@@ -105,6 +107,7 @@ def save_flow(path: Path, points: np.ndarray, result: FlowResult, config: Config
         "in_graph": result.in_graph,
         "is_dynamic": result.is_dynamic,
         "object": result.object_id.astype(np.int32),
+        "std": result.std_m.astype(np.float32),
         "ego_motion": result.ego_motion.astype(np.float64),
         "config": np.array(_to_json(to_dict(config))),
         "stats": np.array(_to_json(asdict(result.stats))),
@@ -132,7 +135,7 @@ def load_flow(path: Path) -> FlowFile:
     if not pose.is_rigid(ego_motion, 1e-4) or not isinstance(config, dict) or not isinstance(stats, dict):
         raise DataError(f"{path}: damaged flow file; its ego_motion, config or stats make no sense")
     return FlowFile(arrays["points"], arrays["flow"], motions, arrays["valid"], arrays["in_graph"],
-                    arrays["is_dynamic"], arrays["object"], ego_motion, config, stats)
+                    arrays["is_dynamic"], arrays["object"], arrays["std"], ego_motion, config, stats)
 
 
 def write_poses_kitti(path: Path, world_from_sensor: np.ndarray) -> None:

@@ -11,19 +11,21 @@ from lidarflow import pose
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.errors import DataError
-from lidarflow.lidar import dynamic, ego, features, frontend, mesh, objects, preparation, start
-from lidarflow.lidar import view as view_of_pair
+from lidarflow.lidar import dynamic, ego, features, frontend, mesh, preparation, start, uncertainty
+from lidarflow.lidar.attribution import WORLD, Attribution, attribute
+from lidarflow.lidar.tracking import Tracks
 from lidarflow.solve import gtsam_lm
-from lidarflow.types import FlowResult, MovingObject, Scan, ScanPair
+from lidarflow.types import FlowResult, Scan, ScanPair
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Previous:
-    """What one pair leaves for the next: its source points, its result, and its target's features."""
+    """What one pair leaves for the next: its source points and result, its target's features, its tracks."""
 
     points: np.ndarray
     result: FlowResult
     target: features.Features
+    tracks: Tracks
 
 
 @dataclass(slots=True)
@@ -41,7 +43,7 @@ class Stopwatch:
 
 def estimate_flow(pair: ScanPair, config: Config | None = None) -> FlowResult:
     """Dense rigid flow from one scan to the next; raises DataError for scans that cannot be used."""
-    return _estimate(pair, config or Config(), previous=None, ego_guess=None)[0]
+    return _estimate(pair, config or Config(), previous=None, ego_guess=None).result
 
 
 class FlowEstimator:
@@ -66,9 +68,8 @@ class FlowEstimator:
             return None
         # Forgotten first: after a scan that cannot be used, the next pair must not inherit an older one's.
         previous, self._previous = self._previous, None
-        result, target = _estimate(ScanPair(source, scan), self.config, previous, guess)
-        self._previous = Previous(source.points, result, target)
-        return result
+        self._previous = _estimate(ScanPair(source, scan), self.config, previous, guess)
+        return self._previous.result
 
 
 def run(dataset: Dataset, frames: list[int], config: Config) -> Iterator[tuple[ScanPair, FlowResult]]:
@@ -85,8 +86,8 @@ def run(dataset: Dataset, frames: list[int], config: Config) -> Iterator[tuple[S
 
 def _estimate(
     pair: ScanPair, config: Config, previous: Previous | None, ego_guess: np.ndarray | None
-) -> tuple[FlowResult, features.Features]:
-    """The result of a pair and the features of its target."""
+) -> Previous:
+    """The result of a pair and what the next one takes over."""
     for scan in (pair.source, pair.target):
         _require_points(scan, config)
     timed = Stopwatch()
@@ -104,19 +105,21 @@ def _estimate(
         graph = frontend.build_problem(pair, source, target, surface_mesh, start_motions, config)
         matches = graph.problem.points[graph.problem.match_index], graph.problem.match_target
     with timed("objects"):
-        on_objects = _OnObjects.none(points)
+        found = Attribution.none(len(points))
         if config.objects.enabled:
-            on_objects = _find_objects(pair, source, target, graph, ego_motion, config)
-            graph = frontend.focused(graph, on_objects.object_id, on_objects.motions, ego_motion)
+            matched = graph.rows[graph.problem.match_index], graph.problem.match_target
+            tracks = previous.tracks if previous else Tracks()
+            found = attribute(pair, source, target, matched, ego_motion, tracks, config)
+            graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
     with timed("solver"):
         motions, solved, stats = gtsam_lm.solve(graph.problem, config.solver, config.graph.min_matches)
     with timed("dense answer"):
         in_graph = graph.variable >= 0
         is_solved = np.zeros(len(points), bool)
         is_solved[in_graph] = solved[graph.variable[in_graph]]
-        on_object = on_objects.object_id >= 0
+        on_object = found.owner != WORLD
         dense = np.tile(ego_motion, (len(points), 1, 1))
-        dense[on_object] = on_objects.motions[on_objects.object_id[on_object]]
+        dense[on_object] = found.motions[found.owner[on_object]]
         dense[in_graph] = motions[graph.variable[in_graph]]
         flow = pose.apply(dense, points) - points
         is_dynamic = on_object
@@ -125,54 +128,34 @@ def _estimate(
             is_dynamic = dynamic.detect(
                 points, residual_flow, is_solved, surface_mesh.edges, ego_motion,
                 pair.target.points[target.usable], pair.dt_s, config.dynamic)
-    valid = source.ground | on_objects.explained | is_solved
-    return FlowResult(
-        flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,
-        on_objects.object_id, on_objects.objects), target
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _OnObjects:
-    """Which points move with which object, and which the objects or the ego-motion explain."""
-
-    object_id: np.ndarray
-    motions: np.ndarray
-    explained: np.ndarray
-    objects: tuple[MovingObject, ...]
-
-    @classmethod
-    def none(cls, points: np.ndarray) -> "_OnObjects":
-        n = len(points)
-        return cls(np.full(n, -1, np.int32), np.empty((0, 4, 4)), np.zeros(n, bool), ())
-
-
-def _find_objects(
-    pair: ScanPair, source: features.Features, target: features.Features, graph: frontend.Graph,
-    ego_motion: np.ndarray, config: Config,
-) -> _OnObjects:
-    """The moving objects among the source's non-ground points."""
-    points = pair.source.points
-    rows = np.flatnonzero(source.usable & ~source.ground)
-    at = np.full(len(points), -1)
-    at[rows] = np.arange(len(rows))
-    matched = at[graph.rows[graph.problem.match_index]]
-    view = view_of_pair.look(
-        pose.apply(ego_motion, points[rows]), pair.target.points[target.usable],
-        target.ground[target.usable], pose.apply(ego_motion, points[source.usable]),
-        (matched, graph.problem.match_target), config.normals.radius_m, config.objects)
-    bodies = objects.find(view, pair.dt_s, config.objects)
-
+    valid = source.ground | found.explained | is_solved
     object_id = np.full(len(points), -1, np.int32)
-    explained = np.zeros(len(points), bool)
-    explained[rows] = ~(view.evidence.unexplained | view.evidence.blind)
-    for number, body in enumerate(bodies):
-        object_id[rows[body.rows]] = number
-        explained[rows[body.rows]] = True
-    motions = [body.over_ground @ ego_motion for body in bodies]
-    described = tuple(
-        objects.describe(number, points[rows[body.rows]], motion, ego_motion, pair.dt_s)
-        for number, (body, motion) in enumerate(zip(bodies, motions, strict=True)))
-    return _OnObjects(object_id, np.array(motions).reshape(-1, 4, 4), explained, described)
+    object_id[on_object] = found.ids[found.owner[on_object]]
+    result = FlowResult(
+        flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,
+        object_id, found.objects, _std(points, found, graph, motions, solved, valid, flow, config))
+    return Previous(points, result, target, found.tracks)
+
+
+def _std(
+    points: np.ndarray, found: Attribution, graph: frontend.Graph, motions: np.ndarray, solved: np.ndarray,
+    valid: np.ndarray, flow: np.ndarray, config: Config,
+) -> np.ndarray:
+    """Standard deviation (N,) of the flow in metres; NaN where the motion rests on no evidence.
+
+    A point of a group errs with the group's motion, and where the graph has moved it away from the group,
+    by that much more. Without groups, the matches around it tell.
+    """
+    std_m = found.std_m.copy()
+    rows = graph.rows[solved]
+    if len(graph.problem.group):
+        by_group = graph.problem.group_motions[graph.problem.group[solved]]
+        apart_m = np.linalg.norm(pose.apply(by_group, points[rows]) - points[rows] - flow[rows], axis=1)
+        std_m[rows] = np.hypot(std_m[rows], apart_m)
+    elif len(rows):
+        std_m[rows] = uncertainty.of_matches(graph.problem, motions, config.solver.truncation_m)[solved]
+    std_m[~valid] = np.nan
+    return std_m
 
 
 def _require_points(scan: Scan, config: Config) -> None:

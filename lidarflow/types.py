@@ -203,7 +203,8 @@ class FlowResult:
     match_target (K, 3) float64      where their matches are, metres, target frame
     is_ground    (N,) bool           ground of the static world; none when not given
     object_id    (N,) int32          the moving object the point is on, -1 = none (the default)
-    objects      tuple               the moving objects, ids 0, 1, …
+    objects      tuple               the moving objects; in a sequence their ids are kept over time
+    std_m        (N,) float64        standard deviation of the flow, metres, over all axes; NaN = unknown
     """
 
     flow: np.ndarray
@@ -219,6 +220,7 @@ class FlowResult:
     is_ground: np.ndarray | None = None
     object_id: np.ndarray | None = None
     objects: tuple[MovingObject, ...] = ()
+    std_m: np.ndarray | None = None
 
     def __post_init__(self):
         _check("FlowResult.flow", self.flow, (None, 3), "f")
@@ -227,6 +229,9 @@ class FlowResult:
             object.__setattr__(self, "is_ground", np.zeros(n, bool))
         if self.object_id is None:
             object.__setattr__(self, "object_id", np.full(n, -1, np.int32))
+        if self.std_m is None:
+            object.__setattr__(self, "std_m", np.full(n, np.nan))
+        _check("FlowResult.std_m", self.std_m, (n,), "f")
         _check("FlowResult.motions", self.motions, (n, 4, 4), "f")
         for name in ("valid", "in_graph", "is_ground", "is_dynamic"):
             _check(f"FlowResult.{name}", getattr(self, name), (n,), "b")

@@ -74,7 +74,7 @@ def test_a_flow_file_is_the_stable_contract(saved):
     assert found["valid"][1] == found["in_graph"][1] == found["is_dynamic"][1] == "b"
     assert {name: shape for name, (shape, _) in found.items()} == {
         "points": (5, 3), "flow": (5, 3), "motion": (5, 7), "valid": (5,), "in_graph": (5,),
-        "is_dynamic": (5,), "object": (5,), "ego_motion": (4, 4), "config": (), "stats": ()}
+        "is_dynamic": (5,), "object": (5,), "std": (5,), "ego_motion": (4, 4), "config": (), "stats": ()}
     assert dtypes == {"flow": np.float32, "motion": np.float32, "object": np.int32, "ego_motion": np.float64}
 
 

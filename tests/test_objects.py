@@ -179,8 +179,10 @@ def scene(car_shift: np.ndarray, seed: int, wall_shift: np.ndarray = (0.0, 0.0, 
     on_ground = np.arange(len(target)) >= len(target) - len(ground)
     matched = np.arange(0, len(source), 20)
     moved = source[matched] + np.where(source[matched, :1] < 13.0, car_shift, wall_shift)
+    everything = np.concatenate([source, ground])
     return view_of_pair.look(
-        source, target, on_ground, np.concatenate([source, ground]), (matched, moved), 0.5, CONFIG)
+        source, target, on_ground, everything, np.arange(len(everything)) >= len(source), (matched, moved),
+        0.5, CONFIG)
 
 
 @pytest.mark.parametrize("shift_m", [0.08, 0.15, 0.6, 1.4])

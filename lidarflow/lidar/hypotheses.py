@@ -1,14 +1,18 @@
 """What a cluster of seeds may have done: translations that matches, votes and planes propose."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import cKDTree
 
+from lidarflow.lidar.clusters import near_rows
 from lidarflow.lidar.surface import CAP_M
 from lidarflow.lidar.view import View
 
 _MATCH_RADIUS_M = 0.5    # matches this near to the seeds speak for them
 _MATCH_MODE_M = 0.15
 _MIN_MATCHES = 3
+_EXPECTED_RADIUS_M = 0.5
 _VOTE_CELL_M = 0.2
 _VOTE_PEAKS = 3
 _MAX_VOTERS = 150
@@ -16,10 +20,25 @@ _MIN_APPEARED = 4
 _MIN_SHIFTED = 5
 
 
-def translations(view: View, rows: np.ndarray, shift: np.ndarray, max_shift_m: float) -> list[np.ndarray]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """An object that earlier pairs lead to expect.
+
+    points  (K, 3)   where it should be before it moves, metres, in the frame of the view
+    shift   (3,)     what it should do over ground, metres
+    """
+
+    points: np.ndarray
+    shift: np.ndarray
+
+
+def translations(
+    view: View, rows: np.ndarray, shift: np.ndarray, expected: tuple[Expected, ...], max_shift_m: float
+) -> list[np.ndarray]:
     """Translations over ground (3,), metres, of the seeds at `rows` (K,), whose planes tell shifts (K, 3)."""
     points = view.points[rows]
-    return [*_of_matches(view, points), *_of_planes(shift), *_of_votes(view, points, max_shift_m)]
+    return [*_of_matches(view, points), *_of_planes(shift), *_of_expected(points, expected),
+            *_of_votes(view, points, max_shift_m)]
 
 
 def spread(points: np.ndarray, count: int) -> np.ndarray:
@@ -44,6 +63,11 @@ def _of_planes(shift: np.ndarray) -> list[np.ndarray]:
     """The median of the shifts that planes tell."""
     known = shift[np.isfinite(shift[:, 0])]
     return [np.median(known, axis=0)] if len(known) >= _MIN_SHIFTED else []
+
+
+def _of_expected(points: np.ndarray, expected: tuple[Expected, ...]) -> list[np.ndarray]:
+    """The shifts of the expected objects that these points may be on."""
+    return [e.shift for e in expected if len(near_rows(e.points, points, _EXPECTED_RADIUS_M))]
 
 
 def _of_votes(view: View, points: np.ndarray, max_shift_m: float) -> list[np.ndarray]:

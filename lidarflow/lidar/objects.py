@@ -19,9 +19,15 @@ _DISTANCE_WEIGHT = 0.3   # of squared distances to points, where those to planes
 _MAX_START_POINTS = 300  # as many choose the start; the fit that follows uses all
 
 
-def find(view: View, dt_s: float, config: ObjectsConfig) -> list[Body]:
-    """The moving objects of a view; no point belongs to two, and the best supported come first."""
-    found = seeds.find(view, config)
+def find(
+    view: View, dt_s: float, config: ObjectsConfig, expected: tuple[hypotheses.Expected, ...] = ()
+) -> list[Body]:
+    """The moving objects of a view; no point belongs to two, and the best supported come first.
+
+    `expected` is what earlier pairs lead to expect: it is looked for where it should be, and believed no
+    more easily than the rest.
+    """
+    found = seeds.find(view, [e.points for e in expected], config)
     label = clusters.linked(view.points[found.rows], _SEED_LINK_M)
     bodies, free = [], np.ones(len(view.points), bool)
     for cluster in np.argsort(-np.bincount(label), kind="stable") if len(label) else ():
@@ -29,7 +35,7 @@ def find(view: View, dt_s: float, config: ObjectsConfig) -> list[Body]:
         seed = found.rows[mine]
         if len(seed) < _MIN_SEEDS:
             continue
-        start = _best_start(view, seed, found.shift[mine])
+        start = _best_start(view, seed, found.shift[mine], expected)
         if start is None:
             continue
         grown = body.grown(view, seed, start, free, config)
@@ -56,7 +62,9 @@ def describe(
     return MovingObject(number, motion, over_ground / dt_s, centre, high - low, yaw, len(points))
 
 
-def _best_start(view: View, seed: np.ndarray, shift: np.ndarray) -> np.ndarray | None:
+def _best_start(
+    view: View, seed: np.ndarray, shift: np.ndarray, expected: tuple[hypotheses.Expected, ...]
+) -> np.ndarray | None:
     """Motion (4, 4) of the seed rows that explains them best, of the translations proposed for them.
 
     None where none explains them clearly better than ego-motion does.
@@ -64,7 +72,7 @@ def _best_start(view: View, seed: np.ndarray, shift: np.ndarray) -> np.ndarray |
     rows, shift = hypotheses.spread(seed, _MAX_START_POINTS), hypotheses.spread(shift, _MAX_START_POINTS)
     points = view.points[rows]
     fits = [rigid_fit.onto(points, view.upright_tree, translation)
-            for translation in hypotheses.translations(view, rows, shift, _MAX_SHIFT_M)]
+            for translation in hypotheses.translations(view, rows, shift, expected, _MAX_SHIFT_M)]
     left_sq = [_misfit_sq(view.after(rows, fit)) for fit in fits]
     by_ego = Misfit(view.by_ego.distance_m[rows], view.by_ego.plane_m[rows])
     if not fits or min(left_sq) > _MAX_START_RATIO * _misfit_sq(by_ego):

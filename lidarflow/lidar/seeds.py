@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from lidarflow.config import ObjectsConfig
 from lidarflow.kernels import coherence
+from lidarflow.lidar.clusters import near_rows
 from lidarflow.lidar.surface import counterparts
 from lidarflow.lidar.view import View
 
@@ -15,6 +16,7 @@ _LEFT_SHARE = 0.35       # of what could be seen there must be unexplained
 _LEFT_POINTS = 4
 _MIN_PLANES = 8          # so many plane distances tell a shift
 _MIN_COHERENCE = 0.5     # share of their squares that one shift explains
+_EXPECTED_RADIUS_M = 0.2
 _MIN_RMS_M = 0.035       # smaller distances are range noise
 
 
@@ -30,15 +32,18 @@ class Seeds:
     shift: np.ndarray
 
 
-def find(view: View, config: ObjectsConfig) -> Seeds:
+def find(view: View, expected: list[np.ndarray], config: ObjectsConfig) -> Seeds:
     """Unexplained points amid unexplained ones, and points whose surface is shifted as one.
 
     The first finds what moves by more than the spacing of points, the second what moves by less: on leaves,
-    plane distances point all ways and no shift explains them.
+    plane distances point all ways and no shift explains them. Where objects are `expected`, given as points
+    (K, 3), everything is a seed.
     """
     left = _left_behind(view)
     shifted, shift = _shifted(view, config)
     rows = np.union1d(left, shifted)
+    for points in expected:
+        rows = np.union1d(rows, near_rows(view.points, points, _EXPECTED_RADIUS_M))
     shift_of = np.full((len(rows), 3), np.nan)
     shift_of[np.searchsorted(rows, shifted)] = shift
     return Seeds(rows, shift_of)

@@ -27,6 +27,7 @@ class View:
     upright        Surface     those of them that are not ground
     upright_tree   cKDTree     over the points of `upright`
     ground         cKDTree     those of them that are
+    source_ground  cKDTree     the source's ground, after ego-motion
     has_appeared   (U,) bool   upright points where the source has nothing after ego-motion
     match_rows     (K,) int64  source points with a descriptor match
     match_shift    (K, 3)      from such a point to its match
@@ -40,6 +41,7 @@ class View:
     upright: Surface
     upright_tree: cKDTree
     ground: cKDTree
+    source_ground: cKDTree
     has_appeared: np.ndarray
     match_rows: np.ndarray
     match_shift: np.ndarray
@@ -57,12 +59,14 @@ class View:
 
 def look(
     points: np.ndarray, target_points: np.ndarray, target_ground: np.ndarray, source_points: np.ndarray,
-    matched: tuple[np.ndarray, np.ndarray], normal_radius_m: float, config: ObjectsConfig,
+    source_ground: np.ndarray, matched: tuple[np.ndarray, np.ndarray], normal_radius_m: float,
+    config: ObjectsConfig,
 ) -> View:
     """The view of a pair, all in the target's sensor frame after ego-motion, metres.
 
     points (N, 3) the source's non-ground points; target_points (M, 3) and which of them are ground (M,);
-    source_points (S, 3) all of the source; matched: rows (K,) of `points` and their matches (K, 3).
+    source_points (S, 3) all of the source and which of them are ground (S,); matched: rows (K,) of `points`
+    and their matches (K, 3).
     """
     source = Surface.of(points, normal_radius_m)
     upright = Surface.of(target_points[~target_ground], normal_radius_m)
@@ -74,7 +78,8 @@ def look(
         points, source.normals, upright, upright_tree, np.minimum(evidence.left_m, CAP_M))
     rows, places = matched
     return View(source, cKDTree(points), evidence, by_ego, cKDTree(target_points), upright, upright_tree,
-                cKDTree(target_points[target_ground]), has_appeared, rows, places - points[rows])
+                cKDTree(target_points[target_ground]), cKDTree(source_points[source_ground]), has_appeared,
+                rows, places - points[rows])
 
 
 def _to_target(

@@ -1,0 +1,114 @@
+"""What every point of a pair moves with: the static world, or one of the moving objects."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarflow import pose
+from lidarflow.config import Config
+from lidarflow.lidar import objects, tracking, uncertainty
+from lidarflow.lidar import view as view_of_pair
+from lidarflow.lidar.body import Body
+from lidarflow.lidar.features import Features
+from lidarflow.lidar.hypotheses import Expected
+from lidarflow.lidar.tracking import Tracks
+from lidarflow.lidar.view import View
+from lidarflow.types import MovingObject, ScanPair
+
+WORLD = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attribution:
+    """What the points of a source scan move with, rows aligned with it.
+
+    owner      (N,) int64       index of the point's object, WORLD = none
+    motions    (G, 4, 4)        of the objects, target_from_source
+    ids        (G,) int32       of the objects, kept over time
+    explained  (N,) bool        an object's motion or the ego-motion explains the point
+    std_m      (N,) float64     standard deviation of where that motion puts the point, metres
+    objects    tuple            the objects, described
+    tracks     Tracks           for the next pair
+    """
+
+    owner: np.ndarray
+    motions: np.ndarray
+    ids: np.ndarray
+    explained: np.ndarray
+    std_m: np.ndarray
+    objects: tuple[MovingObject, ...]
+    tracks: Tracks
+
+    @classmethod
+    def none(cls, count: int) -> "Attribution":
+        """All `count` points with the world, nothing explained, nothing known of any error."""
+        return cls(np.full(count, WORLD), np.empty((0, 4, 4)), np.empty(0, np.int32), np.zeros(count, bool),
+                   np.full(count, np.nan), (), Tracks())
+
+
+def attribute(
+    pair: ScanPair, source: Features, target: Features, matches: tuple[np.ndarray, np.ndarray],
+    ego_motion: np.ndarray, tracks: Tracks, config: Config,
+) -> Attribution:
+    """Find the moving objects of a pair; matches are rows (K,) of the source and their places (K, 3).
+
+    `tracks` are those of the pair before, in the frame of the source.
+    """
+    points = pair.source.points
+    rows = np.flatnonzero(source.usable & ~source.ground)
+    view = _view(pair, source, target, rows, matches, ego_motion, config)
+    bodies = objects.find(view, pair.dt_s, config.objects, _expected(tracks, ego_motion))
+
+    owner, explained = np.full(len(points), WORLD), np.zeros(len(points), bool)
+    explained[rows] = ~(view.evidence.unexplained | view.evidence.blind)
+    for index, body in enumerate(bodies):
+        owner[rows[body.rows]] = index
+        explained[rows[body.rows]] = True
+    clouds = [points[rows[body.rows]] for body in bodies]
+    over_ground = [body.over_ground for body in bodies]
+    motions = [motion @ ego_motion for motion in over_ground]
+    ids = tracking.identify(tracks, clouds)
+    described = tuple(
+        objects.describe(number, cloud, motion, ego_motion, pair.dt_s)
+        for number, cloud, motion in zip(ids, clouds, motions, strict=True))
+    return Attribution(
+        owner, np.array(motions).reshape(-1, 4, 4), np.array(ids, np.int32), explained,
+        _std(points, rows, owner, bodies, view, ego_motion, config), described,
+        tracking.advance(tracks, ids, clouds, over_ground, ego_motion))
+
+
+def _view(
+    pair: ScanPair, source: Features, target: Features, rows: np.ndarray,
+    matches: tuple[np.ndarray, np.ndarray], ego_motion: np.ndarray, config: Config,
+) -> View:
+    points = pair.source.points
+    at = np.full(len(points), -1)
+    at[rows] = np.arange(len(rows))
+    return view_of_pair.look(
+        pose.apply(ego_motion, points[rows]), pair.target.points[target.usable],
+        target.ground[target.usable], pose.apply(ego_motion, points[source.usable]),
+        source.ground[source.usable], (at[matches[0]], matches[1]), config.normals.radius_m, config.objects)
+
+
+def _expected(tracks: Tracks, ego_motion: np.ndarray) -> tuple[Expected, ...]:
+    """What the tracks lead to expect, in the frame of the view: that of the target."""
+    expected = []
+    for track in tracks.followed:
+        over_ground = ego_motion @ track.over_ground @ pose.inverse(ego_motion)
+        points = pose.apply(ego_motion, track.points)
+        expected.append(Expected(points, (pose.apply(over_ground, points) - points).mean(axis=0)))
+    return tuple(expected)
+
+
+def _std(
+    points: np.ndarray, rows: np.ndarray, owner: np.ndarray, bodies: list[Body], view: View,
+    ego_motion: np.ndarray, config: Config,
+) -> np.ndarray:
+    """Standard deviation (N,) in metres of where its motion puts each point; the world's, or its object's."""
+    std_m = uncertainty.of_world(view, np.flatnonzero(owner[rows] == WORLD), pose.apply(ego_motion, points))
+    for index, body in enumerate(bodies):
+        mine = owner == index
+        moved = pose.apply(body.over_ground @ ego_motion, points[mine])
+        # An object's motion is found after ego-motion, but fitted to the target itself: its error is its own.
+        std_m[mine] = uncertainty.of_body(view, body, moved, config.objects.along_ground)
+    return std_m

@@ -1,0 +1,117 @@
+"""How well a motion is known: from the planes that hold it, and how far they are off."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidarflow import pose
+from lidarflow.kernels import grid
+from lidarflow.lidar.body import Body
+from lidarflow.lidar.surface import CAP_M, counterparts, nearest
+from lidarflow.lidar.view import View
+from lidarflow.types import FlowProblem
+
+_CELL_M = 0.5            # planes within one cell err together and count as one
+_GROUND_CELL_M = 2.0
+_PRIOR_STD_M = 1.0       # of a shift, where no plane tells anything
+_PRIOR_STD_RAD = 0.1
+_LEAST_STD_M = 0.01      # of one plane: calibration and range noise do not average out below it
+_NEAREST_MATCHES = 8
+_MATCH_REACH_M = 1.4     # descriptors within one another's support err together,
+_MATCH_SPACING_M = 0.7   # the less, the farther apart they are
+_APART_M = 1e6
+_CALIBRATION_M = 0.005   # of a sensor's ranges and angles: what planes cannot show
+_CALIBRATION_RAD = 2e-4
+_TRIMMED = 3.0           # planes farther off than this many median distances are outliers
+
+
+def of_world(view: View, still: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Standard deviation (N,) in metres of points `moved` (N, 3) by ego-motion, target frame.
+
+    It rests on the planes of the view's rows `still` (K,) and on the ground.
+    """
+    rows = still[np.isin(still, view.source.thinned)]
+    at, normals, off_m = _planes(view, rows, np.eye(4))
+    ground_at, ground_off_m = _ground(view)
+    at, off_m = np.concatenate([at, ground_at]), np.concatenate([off_m, ground_off_m])
+    normals = np.concatenate([normals, np.tile([0.0, 0.0, 1.0], (len(ground_at), 1))])
+    return _std(moved, at, normals, off_m, np.zeros((0, 3)))
+
+
+def of_body(view: View, body: Body, moved: np.ndarray, along_ground: float) -> np.ndarray:
+    """Standard deviation (K,) in metres of points `moved` (K, 3) with a body, target frame."""
+    at, normals, off_m = _planes(view, body.rows, body.over_ground)
+    upright = np.tile([[0.0, 0.0, 1.0]], (1 if along_ground > 0 else 0, 1))
+    return _std(moved, at, normals, off_m, upright)
+
+
+def _planes(
+    view: View, rows: np.ndarray, over_ground: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the points at `rows` go (K, 3), the planes they meet there (K, 3), and how far off (K,)."""
+    moved = pose.apply(over_ground, view.points[rows])
+    turned = pose.turn(over_ground, view.source.normals[rows])
+    row, _, agrees = counterparts(moved, turned, view.upright, view.upright_tree, CAP_M)
+    at, normals = moved[agrees], view.upright.normals[row[agrees]]
+    return at, normals, (normals * (view.upright.points[row[agrees]] - at)).sum(axis=1)
+
+
+def _ground(view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Ground points (K, 3) of the target, one per cell, and how far over the source's they lie (K,)."""
+    ground = np.asarray(view.ground.data)
+    ground = ground[grid.first_per_voxel(ground, _GROUND_CELL_M)]
+    distance_m, row = nearest(view.source_ground, ground, _CELL_M)
+    found = np.isfinite(distance_m)
+    return ground[found], view.source_ground.data[row[found]][:, 2] - ground[found][:, 2]
+
+
+def _std(
+    moved: np.ndarray, at: np.ndarray, normals: np.ndarray, off_m: np.ndarray, held: np.ndarray
+) -> np.ndarray:
+    """Standard deviation (N,) of points that move with a fit to planes.
+
+    Its covariance is (Σ JᵀJ / (n s²) + prior)⁻¹, where J is the row [x × n, n] of a plane at x, s its
+    standard deviation over the fit, n the planes in its cell. Directions `held` (H, 3) count as known.
+    """
+    centre = at.mean(axis=0) if len(at) else np.zeros(3)
+    information = np.diag([_PRIOR_STD_RAD**-2] * 3 + [_PRIOR_STD_M**-2] * 3)
+    if len(at):
+        size = np.abs(off_m)
+        kept = size <= _TRIMMED * max(float(np.median(size)), _LEAST_STD_M)
+        at, normals, off_m = at[kept] - centre, normals[kept], off_m[kept]
+        variance = max(float((off_m**2).mean()), _LEAST_STD_M**2)
+        _, cell, count = np.unique(
+            np.floor(at / _CELL_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+        rows = np.hstack([np.cross(at, normals), normals])
+        information += (rows / (count[cell.ravel()] * variance)[:, None]).T @ rows
+    for direction in held:
+        row = np.concatenate([np.zeros(3), direction])
+        information += np.outer(row, row) / _LEAST_STD_M**2
+    covariance = np.linalg.inv(information)
+    # A point at x moves by ω × x + t.
+    x = moved - centre
+    jacobian = np.concatenate([-pose.hat(x), np.broadcast_to(np.eye(3), (len(x), 3, 3))], axis=2)
+    by_fit_sq = np.einsum("nij,jk,nik->n", jacobian, covariance, jacobian)
+    by_angle_sq = (_CALIBRATION_RAD**2) * (moved**2).sum(axis=1)
+    return np.sqrt(by_fit_sq + _CALIBRATION_M**2 + by_angle_sq)
+
+
+def of_matches(problem: FlowProblem, motions: np.ndarray, truncation_m: float) -> np.ndarray:
+    """Standard deviation (M,) in metres of solved variables, from the matches around each of them.
+
+    It is how far the nearest inliers of the component are off, over the root of how many of them lie within
+    the reach of one: matches nearer to each other than that err together. NaN without an inlier.
+    """
+    at, target = problem.points[problem.match_index], problem.match_target
+    off_m = np.linalg.norm(pose.apply(motions[problem.match_index], at) - target, axis=1)
+    kept = off_m <= truncation_m
+    component = problem.component[problem.match_index[kept]]
+    # Components far apart along a fourth axis share one tree.
+    tree = cKDTree(np.column_stack([at[kept], component * _APART_M]))
+    query = np.column_stack([problem.points, problem.component * _APART_M])
+    distance_m, row = tree.query(query, k=_NEAREST_MATCHES, distance_upper_bound=_APART_M / 2)
+    found = np.isfinite(distance_m)
+    off_sq = np.where(found, np.append(off_m[kept] ** 2, 0.0)[row], 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean_sq = off_sq.sum(axis=1) / found.sum(axis=1)
+    near = tree.query_ball_point(query, _MATCH_REACH_M, return_length=True)
+    return np.sqrt(mean_sq / np.maximum(near * (_MATCH_SPACING_M / _MATCH_REACH_M) ** 2, 1.0))
