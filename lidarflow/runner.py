@@ -140,7 +140,15 @@ def figures_of(report: PairReport) -> dict[str, float]:
         s = report.scores
         figures |= {
             "epe_all_m": s.all.mean, "epe_static_m": s.static.mean, "epe_dynamic_m": s.dynamic.mean,
-            "epe_dynamic_median_m": s.dynamic.median, "graph_epe_static_m": s.graph_static.mean,
+            "epe_dynamic_median_m": s.dynamic.median,
+            "dynamic_error_over_speed": s.dynamic_error_over_speed,
+            "strict_accuracy": s.accuracy_all.strict, "strict_accuracy_static": s.accuracy_static.strict,
+            "strict_accuracy_dynamic": s.accuracy_dynamic.strict,
+            "epe_foreground_dynamic_m": s.three_way.foreground_dynamic,
+            "epe_foreground_static_m": s.three_way.foreground_static,
+            "epe_background_static_m": s.three_way.background_static,
+            "epe_three_way_m": s.three_way.mean, "dynamic_iou": s.three_way.dynamic_iou,
+            "graph_epe_static_m": s.graph_static.mean,
             "graph_epe_dynamic_m": s.graph_dynamic.mean,
             "graph_epe_dynamic_median_m": s.graph_dynamic.median, "t_e_m": s.t_e, "r_e_rad": s.r_e_rad,
             "movers_found": s.movers_found, "false_movers": s.false_movers, "ego_error_m": s.ego_error_m,

@@ -53,6 +53,13 @@ def test_eight_rows_are_scored_as_by_hand():
     assert scores.movers_found == pytest.approx(1 / 2)
     assert scores.false_movers == pytest.approx(1 / 4)
     assert scores.ego_error_m == pytest.approx(0.5) and scores.ego_error_rad == pytest.approx(0.0)
+    assert scores.dynamic_error_over_speed == pytest.approx(2.0 / 2.0), "mean error 2 m, and 2 m a frame"
+    assert (scores.accuracy_all.strict, scores.accuracy_static.strict) == pytest.approx((1 / 6, 1 / 4))
+    assert scores.accuracy_dynamic.strict == 0.0
+    three_way = scores.three_way
+    assert (three_way.foreground_dynamic, three_way.background_static) == pytest.approx((2.0, 0.3))
+    assert np.isnan(three_way.foreground_static) and np.isnan(three_way.mean)
+    assert three_way.dynamic_iou == pytest.approx(1 / 3), "row 4 of rows 1, 4 and 5"
 
 
 def test_without_movers_their_scores_are_nan_and_the_rest_stays():
