@@ -2,6 +2,7 @@
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -44,6 +45,7 @@ class PairReport:
     truth: str
     stats: SolveStats
     seconds: dict[str, float]
+    valid_share: float = float("nan")     # of the points, how many have a motion that rests on evidence
 
 
 def choose_frames(dataset: Dataset, jump: int, count: int | None) -> list[int]:
@@ -106,25 +108,57 @@ def process(
 
 
 def metrics_of(reports: list[PairReport], config: Config) -> dict:
-    """What metrics.json holds: the mean over pairs, and every pair; wall times are kept elsewhere."""
-    pairs = []
-    for report in reports:
-        values = asdict(report)
-        del values["seconds"]
-        pairs.append(values)
-    return {"crispness_sigma_m": config.crispness.sigma_m, "mean": mean_of(reports), "pairs": pairs}
+    """What metrics.json holds; wall times are kept elsewhere, so that equal runs are equal.
+
+    mean, std  of the figures of every pair, over pairs
+    three_way, bucketed, by_range, by_speed   over the points of all pairs, where all of them have a truth
+    pairs      what is known of every pair
+    """
+    spread = _over_pairs(reports)
+    scored = [report.scores for report in reports if report.scores is not None]
+    whole = metrics.pool(scored) if scored and len(scored) == len(reports) else None
+    return {
+        "crispness_sigma_m": config.crispness.sigma_m,
+        "truth": truth_of(reports),
+        "mean": {name: mean for name, (mean, _) in spread.items()},
+        "std": {name: std for name, (_, std) in spread.items()},
+        **({} if whole is None else _plain_pooled(whole)),
+        "pairs": [_plain_pair(report) for report in reports],
+    }
 
 
 def mean_of(reports: list[PairReport]) -> dict[str, float]:
     """Means over pairs of the main figures; figures without a value in a pair leave that pair out."""
+    return {name: mean for name, (mean, _) in _over_pairs(reports).items()}
+
+
+def truth_of(reports: list[PairReport]) -> str:
+    """What the pairs were scored against, e.g. "flow" or "flow (4 pairs), none (1)"."""
+    counts = Counter(report.truth for report in reports)
+    if len(counts) == 1:
+        return reports[0].truth
+    return ", ".join(f"{origin} ({count} pairs)" for origin, count in counts.items())
+
+
+def _over_pairs(reports: list[PairReport]) -> dict[str, tuple[float, float]]:
+    """Mean and standard deviation of every figure that some pair has a value of."""
     rows = [figures_of(report) for report in reports]
     names = dict.fromkeys(name for row in rows for name in row)
-    means = {}
-    for name in names:
-        values = np.array([row[name] for row in rows if name in row and np.isfinite(row[name])])
-        if len(values):
-            means[name] = float(values.mean())
-    return means
+    found = {name: metrics.over_frames(row[name] for row in rows if name in row) for name in names}
+    return {name: (mean, std) for name, (mean, std) in found.items() if np.isfinite(mean)}
+
+
+def _plain_pair(report: PairReport) -> dict:
+    values = asdict(report)
+    del values["seconds"]
+    if values["scores"] is not None:
+        del values["scores"]["buckets"]     # sums to be pooled, nothing to be read
+    return values
+
+
+def _plain_pooled(whole: metrics.Pooled) -> dict:
+    three_way = {"mean_m": whole.three_way.mean_m, "dynamic_iou": whole.three_way.dynamic_iou}
+    return {**asdict(whole), "three_way": {**three_way, **asdict(whole.three_way)}}
 
 
 def figures_of(report: PairReport) -> dict[str, float]:
@@ -133,27 +167,12 @@ def figures_of(report: PairReport) -> dict[str, float]:
         "crispness_before": report.alignment.before,
         "crispness_by_ego": report.alignment.by_ego,
         "crispness_after": report.alignment.after,
+        "valid_share": report.valid_share,
         "moving_points": float(report.moving_points),
         "objects": float(report.objects),
     }
     if report.scores is not None:
-        s = report.scores
-        figures |= {
-            "epe_all_m": s.all.mean, "epe_static_m": s.static.mean, "epe_dynamic_m": s.dynamic.mean,
-            "epe_dynamic_median_m": s.dynamic.median,
-            "dynamic_error_over_speed": s.dynamic_error_over_speed,
-            "strict_accuracy": s.accuracy_all.strict, "strict_accuracy_static": s.accuracy_static.strict,
-            "strict_accuracy_dynamic": s.accuracy_dynamic.strict,
-            "epe_foreground_dynamic_m": s.three_way.foreground_dynamic,
-            "epe_foreground_static_m": s.three_way.foreground_static,
-            "epe_background_static_m": s.three_way.background_static,
-            "epe_three_way_m": s.three_way.mean, "dynamic_iou": s.three_way.dynamic_iou,
-            "graph_epe_static_m": s.graph_static.mean,
-            "graph_epe_dynamic_m": s.graph_dynamic.mean,
-            "graph_epe_dynamic_median_m": s.graph_dynamic.median, "t_e_m": s.t_e, "r_e_rad": s.r_e_rad,
-            "movers_found": s.movers_found, "false_movers": s.false_movers, "ego_error_m": s.ego_error_m,
-            "ego_error_deg": float(np.degrees(s.ego_error_rad)),
-        }
+        figures |= metrics.figures(report.scores)
     return figures
 
 
@@ -186,6 +205,7 @@ def report_pair(
         truth=origin,
         stats=result.stats,
         seconds=result.seconds,
+        valid_share=metrics.mean_of(result.valid[np.isfinite(pair.source.points).all(axis=1)]),
     )
 
 

@@ -259,8 +259,9 @@ def test_the_widest_table_fits_80_columns(monkeypatch, capsys, enabled):
     """Up to ten columns, with the names and figures of a long drive; the graph's only without objects."""
     alignment = metrics.Alignment(0.741, 0.9, 0.969, 0.2)
     summary = metrics.ErrorSummary(100, 12.345, 1.2)
-    rest = [metrics.Accuracy(*[0.1] * 5)] * 3 + [metrics.ThreeWay(*[0.1] * 5)] + [0.1] * 7
-    scores = metrics.Scores(*[summary] * 5, *rest)
+    part = metrics.MeanError(100, 0.1)
+    scores = metrics.Scores(*[summary] * 5, *[metrics.Accuracy(*[0.1] * 5)] * 3,
+                            metrics.ThreeWay(part, part, part, 1, 1, 1), None, (), (), *[0.1] * 7)
     reports = [runner.PairReport(name, 123456, 5000, 123456, 42, 999, alignment, scores, "flow", None,
                                  {"all": 999.9})
                for name in ("0000000000", "315966265259836000")]

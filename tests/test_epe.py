@@ -68,11 +68,23 @@ def test_three_way_on_eight_rows():
     on_object = np.array([1, 1, 1, 1, 0, 0, 0, 1], bool)
     called = np.array([1, 0, 1, 0, 0, 0, 1, 1], bool)
     found = metrics.three_way(error, speed_m[:, None] * [0, 0, 1.0], on_object, called)
-    assert found.foreground_dynamic == pytest.approx((0.1 + 0.3 + 0.2) / 3)
-    assert found.foreground_static == pytest.approx((0.05 + 0.07) / 2)
-    assert found.background_static == pytest.approx((0.01 + 0.03) / 2), "moving background is in none"
-    assert found.mean == pytest.approx((0.2 + 0.06 + 0.02) / 3)
+    assert found.foreground_dynamic.mean == pytest.approx((0.1 + 0.3 + 0.2) / 3)
+    assert found.foreground_static.mean == pytest.approx((0.05 + 0.07) / 2)
+    assert found.background_static.mean == pytest.approx((0.01 + 0.03) / 2), "moving background is in none"
+    assert found.mean_m == pytest.approx((0.2 + 0.06 + 0.02) / 3)
     assert found.dynamic_iou == pytest.approx(3 / 5), "rows 0, 6, 7 of rows 0, 1, 2, 6, 7"
+
+
+def test_pairs_are_pooled_point_by_point():
+    one, three, none = metrics.MeanError(1, 0.4), metrics.MeanError(3, 0.2), metrics.MeanError(0, np.nan)
+    assert metrics.pooled([one, three, none]) == metrics.MeanError(4, pytest.approx(0.25))
+    assert np.isnan(metrics.pooled([none, none]).mean)
+    pairs = [metrics.ThreeWay(one, three, one, 3, 1, 0), metrics.ThreeWay(none, one, three, 0, 2, 2)]
+    found = metrics.pooled_three_way(pairs)
+    assert np.isnan(pairs[1].mean_m) and found.mean_m == pytest.approx((0.4 + 0.25 + 0.25) / 3)
+    assert (found.foreground_dynamic.points, found.dynamic_iou) == (1, pytest.approx(3 / 8))
+    nothing = metrics.ThreeWay(none, none, none, 0, 0, 0)
+    assert np.isnan(nothing.dynamic_iou)
 
 
 def test_three_way_looks_at_points_within_50_metres_above_ground():

@@ -4,6 +4,7 @@ Thresholds are those of the field (FlowNet3D, HPLFlowNet, Argoverse 2): a point 
 is small in metres or beside the length of its true flow.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,14 @@ class ErrorSummary:
     points: int
     mean: float
     median: float
+
+
+@dataclass(frozen=True, slots=True)
+class MeanError:
+    """Mean end-point error in metres over a set of points; NaN where it is empty."""
+
+    points: int
+    mean: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +65,18 @@ def summarise(error: np.ndarray) -> ErrorSummary:
     if len(error) == 0:
         return ErrorSummary(0, float("nan"), float("nan"))
     return ErrorSummary(len(error), float(error.mean()), float(np.median(error)))
+
+
+def mean_error(error: np.ndarray) -> MeanError:
+    """Count and mean of errors (N,) in metres."""
+    return MeanError(len(error), mean_of(error))
+
+
+def pooled(parts: Sequence[MeanError]) -> MeanError:
+    """The error of several sets of points together, every point counting alike."""
+    points = sum(part.points for part in parts)
+    total_m = sum(part.points * part.mean for part in parts if part.points)
+    return MeanError(points, total_m / points if points else float("nan"))
 
 
 def accuracy(flow: np.ndarray, truth: np.ndarray) -> Accuracy:

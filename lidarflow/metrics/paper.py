@@ -1,4 +1,6 @@
-"""The errors that Dewan et al. 2016 print."""
+"""The errors that Dewan et al. 2016 print: means over points, then mean ± standard deviation over frames."""
+
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -17,3 +19,12 @@ def pose_errors(points: np.ndarray, motions: np.ndarray, true_motion: np.ndarray
     truth = np.broadcast_to(true_motion, motions.shape)
     off_m = np.linalg.norm(pose.apply(motions, points) - pose.apply(truth, points), axis=1)
     return float(off_m.mean()), float(pose.rotation_distance(truth, motions).mean())
+
+
+def over_frames(values: Iterable[float]) -> tuple[float, float]:
+    """Mean and standard deviation of one value per frame; values that are not finite are left out.
+
+    The deviation is that of the frames themselves (divided by their number); both are NaN without frames.
+    """
+    values = np.array([value for value in values if np.isfinite(value)])
+    return (float(values.mean()), float(values.std())) if len(values) else (float("nan"), float("nan"))
