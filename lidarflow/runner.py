@@ -177,15 +177,16 @@ def figures_of(report: PairReport) -> dict[str, float]:
 
 
 def find_truth(dataset: Dataset, index: int, pair: ScanPair) -> tuple[Truth | None, str]:
-    """Truth of the pair at `index`, and where it comes from: "flow", "poses" or "none"."""
+    """Truth of the pair at `index`, and what it was made of: "flow", "boxes", "poses", … or "none"."""
     truth = dataset.truth(index)
     if truth is not None:
-        return truth, "flow"
+        return truth, truth.origin
     world_from_sensor = dataset.world_from_sensor()
     if world_from_sensor is None:
         return None, "none"
     ego_motion = pose.inverse(world_from_sensor[index + 1]) @ world_from_sensor[index]
-    return metrics.static_truth(pair.source.points, ego_motion), "poses (every point taken as static)"
+    truth = metrics.static_truth(pair.source.points, ego_motion)
+    return truth, truth.origin
 
 
 def report_pair(

@@ -92,6 +92,7 @@ class Truth:
     object_id   (N,) int       id of the object the point is on, -1 = background
     category    (N,) int       a Category each; None = not known
     is_ground   (N,) bool      the point is on the ground; none when not given
+    origin      str            what it was made of, e.g. "flow" or "boxes"
     """
 
     flow: np.ndarray
@@ -101,6 +102,7 @@ class Truth:
     object_id: np.ndarray
     category: np.ndarray | None = None
     is_ground: np.ndarray | None = None
+    origin: str = "flow"
 
     def __post_init__(self):
         _check("Truth.flow", self.flow, (None, 3), "f")

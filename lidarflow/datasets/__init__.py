@@ -5,7 +5,7 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from lidarflow.datasets import argoverse2, clouds, kitti, range_images
+from lidarflow.datasets import argoverse2, clouds, kitti, kitti_tracking, range_images
 from lidarflow.datasets.base import Dataset
 from lidarflow.datasets.clouds import read_points, read_scan
 from lidarflow.datasets.folder import kitti_scan_folder
@@ -17,6 +17,7 @@ __all__ = ["LOADERS", "Dataset", "guess_loader", "loader_names", "open_dataset",
 LOADERS = {
     "kitti": "lidarflow.datasets.kitti:KittiOdometry",
     "kitti_raw": "lidarflow.datasets.folder:KittiRaw",
+    "kitti_tracking": "lidarflow.datasets.kitti_tracking:KittiTracking",
     "argoverse2": "lidarflow.datasets.argoverse2:Argoverse2",
     "range_images": "lidarflow.datasets.range_images:RangeImages",
     "folder": "lidarflow.datasets.folder:CloudFolder",
@@ -73,6 +74,8 @@ def guess_loader(folder: Path) -> str:
     suffixes = {file.suffix.lower() for file in clouds.visible_files(root)}
     if kitti.sequence_folders(root) or ((root / "velodyne").is_dir() and (root / "calib.txt").is_file()):
         return "kitti"
+    if kitti_tracking.is_sequence(root) or kitti_tracking.sequence_folders(root):
+        return "kitti_tracking"
     if kitti_scan_folder(root) is not None:
         return "kitti_raw"
     if argoverse2.is_log(root) or argoverse2.log_folders(root):

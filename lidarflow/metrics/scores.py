@@ -145,4 +145,5 @@ def static_truth(points: np.ndarray, ego_motion: np.ndarray) -> Truth:
         valid=np.isfinite(points).all(axis=1),
         is_dynamic=np.zeros(n, bool),
         object_id=np.full(n, -1),
+        origin="poses (every point taken as static)",
     )
