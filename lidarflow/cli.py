@@ -137,6 +137,45 @@ def run(
     _process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans)
 
 
+@app.command(name="eval")
+def evaluate(
+    what: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="A run folder, or a flow file (.npz).")],
+    truth: Annotated[Path | None, typer.Option(
+        help="Folder of <scan>.npz with the truth, or one file; that of the data if not given.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Where the run's data are now, if they moved.")] = None,
+    out: Annotated[Path | None, typer.Option(
+        "--out", help="Metrics file (.json) to write; RUN_DIR/metrics.json if not given.")] = None,
+) -> None:
+    """Score results against the truth."""
+    from lidarflow import evaluation, io, metrics, score_tables, tables
+
+    if out is not None:
+        io.check_output("--out", out, ".json", inputs=(what,))
+    with _working(f"scores of {what}"):
+        if what.is_dir():
+            done = evaluation.evaluate_run(what, truth, data)
+            out = out or what / io.METRICS_FILE
+        else:
+            done = evaluation.evaluate_file(what, truth)
+        if out is not None:
+            io.write_json(out, done.metrics())
+    scores = [report.scores for report in done.reports]
+    whole = metrics.pool(scores)
+    print(f"results    {what}")
+    print(f"truth      {done.truth}, from {done.truth_place}\n")
+    shown = [tables.run_table(done.reports, done.config), score_tables.error_table(scores),
+             score_tables.three_way_table(whole),
+             *([] if whole.bucketed is None else [score_tables.class_table(whole.bucketed)]),
+             score_tables.interval_table("by range [m]", whole.by_range),
+             score_tables.interval_table("by speed [m a frame]", whole.by_speed),
+             score_tables.frame_table(scores, all_points=not done.config.objects.enabled)]
+    for table in shown:
+        _print(table)
+        print()
+    if out is not None:
+        print(f"metrics    {out}")
+
+
 @app.command()
 def view(
     what: Annotated[Path, typer.Argument(help="A run folder, a recording (.rrd) or a flow file (.npz).")],

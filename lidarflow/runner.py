@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, metrics, pipeline, pose, preview
+from lidarflow import io, metrics, pipeline, pose, preview, provenance
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.errors import DataError, LidarflowError
-from lidarflow.types import FlowResult, ScanPair, SolveStats, Truth
+from lidarflow.types import FlowResult, Scan, ScanPair, SolveStats, Truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,20 +32,24 @@ class Viewing:
 
 @dataclass(frozen=True, slots=True)
 class PairReport:
-    """What is known of one pair once it is done: scores are None where there is no truth."""
+    """What is known of one pair once it is done; scores are None where there is no truth.
+
+    matches      None where only the flow file is left, which does not hold them
+    valid_share  how many of the points have a motion that rests on evidence
+    """
 
     frame: str
     points: int
     graph_points: int
     moving_points: int
     objects: int
-    matches: int
+    matches: int | None
     alignment: metrics.Alignment
     scores: metrics.Scores | None
     truth: str
     stats: SolveStats
     seconds: dict[str, float]
-    valid_share: float = float("nan")     # of the points, how many have a motion that rests on evidence
+    valid_share: float = float("nan")
 
 
 def choose_frames(dataset: Dataset, jump: int, count: int | None) -> list[int]:
@@ -78,6 +82,7 @@ def process(
     first = next(results)
     io.new_run_folder(out)
     io.write_toml(out / io.CONFIG_FILE, config)
+    provenance.write(out, provenance.RunSource(dataset.source, tuple(frames)))
     world_from_sensor, times_ns, objects = [np.eye(4)], [], []
     with _recording(out / io.RECORDING_FILE, viewing) as stream:
         for index, (pair, result) in zip(frames, _chained(first, results), strict=False):
@@ -101,7 +106,7 @@ def process(
     io.write_objects(out / io.OBJECTS_FILE, objects)
     with io.written_aside(out / "preview.png") as aside:
         preview.write_preview(aside, pair, result)
-    io.write_json(out / "metrics.json", metrics_of(reports, config))
+    io.write_json(out / io.METRICS_FILE, metrics_of(reports, config))
     io.write_json(out / "timing.json", {r.frame: r.seconds for r in reports})
     io.link_latest(out)
     return reports
@@ -194,19 +199,28 @@ def report_pair(
 ) -> PairReport:
     """Scores of a finished pair, the one from the data set's scan `index` to the next."""
     truth, origin = find_truth(dataset, index, pair)
+    alignment = metrics.alignment(pair.source, pair.target, result, config.crispness.sigma_m)
+    return report_result(pair.source, result, len(result.match_source), alignment, truth, origin)
+
+
+def report_result(
+    source: Scan, result: FlowResult, matches: int | None, alignment: metrics.Alignment,
+    truth: Truth | None, origin: str,
+) -> PairReport:
+    """Scores of the flow of `source`; `origin` says what its truth was made of."""
     return PairReport(
-        frame=pair.source.name,
-        points=len(pair.source),
+        frame=source.name,
+        points=len(source),
         graph_points=int((result.in_graph & result.valid).sum()),
         moving_points=int(result.is_dynamic.sum()),
-        objects=len(result.objects),
-        matches=len(result.match_source),
-        alignment=metrics.alignment(pair.source, pair.target, result, config.crispness.sigma_m),
-        scores=None if truth is None else metrics.score(pair.source.points, result, truth),
+        objects=len(np.unique(result.object_id[result.object_id >= 0])),
+        matches=matches,
+        alignment=alignment,
+        scores=None if truth is None else metrics.score(source.points, result, truth),
         truth=origin,
         stats=result.stats,
         seconds=result.seconds,
-        valid_share=metrics.mean_of(result.valid[np.isfinite(pair.source.points).all(axis=1)]),
+        valid_share=metrics.mean_of(result.valid[np.isfinite(source.points).all(axis=1)]),
     )
 
 

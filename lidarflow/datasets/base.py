@@ -3,6 +3,7 @@
 import itertools
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -17,17 +18,29 @@ DEFAULT_PERIOD_NS = 100_000_000
 TRUTH_ARRAYS = ("flow", "valid", "dynamic", "track", "target_from_source")
 
 
+@dataclass(frozen=True, slots=True)
+class Source:
+    """What `open_dataset` opened a data set with, so that it can be opened again."""
+
+    folder: Path
+    loader: str
+    sequence: str | None
+    kitti_correction: str
+
+
 class Dataset(Protocol):
     """A sequence of scans from one sensor, in order of time.
 
     name    what messages call it, e.g. "kitti 00"
     loader  the name that `open_dataset` knows it by
     note    what was assumed while opening it, "" for nothing
+    source  set by `open_dataset`, None for a data set that was made in another way
     """
 
     name: str
     loader: str
     note: str
+    source: Source | None
 
     def __len__(self) -> int: ...
 
@@ -50,6 +63,7 @@ class ScanFiles:
     """
 
     loader = "folder"
+    source: Source | None = None
 
     def __init__(self, name: str, files: Sequence[Path], times_ns: Sequence[int] | None = None,
                  correct: bool = False, notes: Sequence[str] = ()):

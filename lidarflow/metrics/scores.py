@@ -21,6 +21,8 @@ from lidarflow.metrics.ranges import Interval, by_range, by_speed, pooled_interv
 from lidarflow.metrics.three_way import ThreeWay, evaluated, pooled_three_way, three_way
 from lidarflow.types import FlowResult, Truth
 
+POSES_ONLY = "poses (every point taken as static)"
+
 
 @dataclass(frozen=True, slots=True)
 class Scores:
@@ -145,5 +147,5 @@ def static_truth(points: np.ndarray, ego_motion: np.ndarray) -> Truth:
         valid=np.isfinite(points).all(axis=1),
         is_dynamic=np.zeros(n, bool),
         object_id=np.full(n, -1),
-        origin="poses (every point taken as static)",
+        origin=POSES_ONLY,
     )
