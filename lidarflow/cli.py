@@ -147,7 +147,8 @@ def evaluate(
         "--out", help="Metrics file (.json) to write; RUN_DIR/metrics.json if not given.")] = None,
 ) -> None:
     """Score results against the truth."""
-    from lidarflow import evaluation, io, metrics, score_tables, tables
+    from lidarflow import evaluation, io, score_tables
+    from lidarflow.tables import run_table
 
     if out is not None:
         io.check_output("--out", out, ".json", inputs=(what,))
@@ -159,17 +160,9 @@ def evaluate(
             done = evaluation.evaluate_file(what, truth)
         if out is not None:
             io.write_json(out, done.metrics())
-    scores = [report.scores for report in done.reports]
-    whole = metrics.pool(scores)
     print(f"results    {what}")
     print(f"truth      {done.truth}, from {done.truth_place}\n")
-    shown = [tables.run_table(done.reports, done.config), score_tables.error_table(scores),
-             score_tables.three_way_table(whole),
-             *([] if whole.bucketed is None else [score_tables.class_table(whole.bucketed)]),
-             score_tables.interval_table("by range [m]", whole.by_range),
-             score_tables.interval_table("by speed [m a frame]", whole.by_speed),
-             score_tables.frame_table(scores, all_points=not done.config.objects.enabled)]
-    for table in shown:
+    for table in (run_table(done.reports, done.config), *score_tables.tables_of(done)):
         _print(table)
         print()
     if out is not None:

@@ -14,7 +14,7 @@ from lidarflow.datasets.base import read_truth
 from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.errors import DataError
 from lidarflow.runner import PairReport
-from lidarflow.types import Scan, ScanPair, Truth
+from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
 _UNKNOWN = float("nan")
 _SAME_POINT_M = 1e-3
@@ -113,12 +113,10 @@ def _from_dataset(
         if file is None:
             raise DataError(f"{run_dir}: no flow of scan {source.name} ({len(files)} flow files for "
                             f"{len(scans) - 1} pairs); was the run cut short? run it again")
-        found = io.load_flow(file)
-        _check_points(file, found.points, source, dataset)
-        result = found.result()
-        pair = ScanPair(source, target)
+        points, result = _read(file)
+        _check_points(file, points, source, dataset)
         if truth is None:
-            known, origin = runner.find_truth(dataset, index, pair)
+            known, origin = runner.find_truth(dataset, index, ScanPair(source, target))
         else:
             known = _given_truth(truth, source.name, len(source), len(scans) - 1)
             origin = known.origin
@@ -133,14 +131,23 @@ def _from_files(
     file: Path, following: Path | None, truth: Path, pairs: int, config: Config
 ) -> PairReport:
     """A report without the data set: the target is the next flow file's cloud, where there is one."""
-    found = io.load_flow(file)
-    source, result = Scan(found.points, name=file.stem), found.result()
+    points, result = _read(file)
+    source = Scan(points, name=file.stem)
     known = _given_truth(truth, source.name, len(source), pairs)
     alignment = metrics.Alignment(_UNKNOWN, _UNKNOWN, _UNKNOWN, config.crispness.sigma_m)
     if following is not None:
         target = Scan(io.load_flow(following).points, name=following.stem)
         alignment = metrics.alignment(source, target, result, config.crispness.sigma_m)
     return runner.report_result(source, result, None, alignment, known, known.origin)
+
+
+def _read(file: Path) -> tuple[np.ndarray, FlowResult]:
+    """The source cloud's points (N, 3) and the answer in a flow file."""
+    found = io.load_flow(file)
+    try:
+        return found.points, found.result()
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{file}: damaged flow file ({error})") from None
 
 
 def _given_truth(place: Path, name: str, rows: int, pairs: int) -> Truth:

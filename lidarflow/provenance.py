@@ -32,6 +32,8 @@ def read(run_dir: Path) -> RunSource:
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
         scans = tuple(int(index) for index in values["scans"])
+        if len(scans) < 2 or min(scans) < 0:
+            raise ValueError("scans must be two indices or more")
         if "data" not in values:
             return RunSource(None, scans)
         texts = values["data"], values["loader"], values["kitti_correction"]

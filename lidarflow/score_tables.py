@@ -6,9 +6,21 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from lidarflow.metrics import Accuracy, Bucketed, ErrorSummary, Interval, Pooled, Scores, over_frames
+from lidarflow.evaluation import Evaluation
+from lidarflow.metrics import Accuracy, Bucketed, ErrorSummary, Interval, Scores, ThreeWay, over_frames, pool
 
 _PER_CENT, _DEGREES = 100.0, 180.0 / np.pi
+
+
+def tables_of(done: Evaluation) -> list[Table]:
+    """Every table that an evaluation fills."""
+    scores = [report.scores for report in done.reports]
+    whole = pool(scores)
+    by_class = [] if whole.bucketed is None else [class_table(whole.bucketed)]
+    return [error_table(scores), three_way_table(whole.three_way), *by_class,
+            interval_table("by range [m]", whole.by_range),
+            interval_table("by speed [m a frame]", whole.by_speed),
+            frame_table(scores, all_points=not done.config.objects.enabled)]
 
 
 def error_table(scores: Sequence[Scores]) -> Table:
@@ -41,9 +53,8 @@ def error_table(scores: Sequence[Scores]) -> Table:
     return table
 
 
-def three_way_table(whole: Pooled) -> Table:
-    """Three-way error and dynamic IoU over all pairs' points."""
-    found = whole.three_way
+def three_way_table(found: ThreeWay) -> Table:
+    """Three-way error and dynamic IoU."""
     table = _table("three-way error, |x|, |y| ≤ 50 m", "points", "[m]")
     for title, part in (("foreground dynamic", found.foreground_dynamic),
                         ("foreground static", found.foreground_static),

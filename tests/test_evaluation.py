@@ -224,7 +224,13 @@ def test_data_of_another_run(lidarflow, run, tmp_path):
 def test_what_is_no_run(lidarflow, data, run):
     assert "no source.json" in lidarflow.complaint("eval", data)
     assert "no such file" in lidarflow.complaint("eval", "nowhere")
+    file = run / "flow" / "000001.npz"
+    with np.load(file) as archive:
+        np.savez(file, **{**archive, "stats": np.array("{}")})
+    assert "000001.npz: damaged flow file (SolveStats" in lidarflow.complaint("eval", "run")
     (run / "source.json").write_text('{"scans": [0, 1, 2], "data": 5, "loader": "kitti"}')
     assert "damaged (KeyError" in lidarflow.complaint("eval", "run")
+    (run / "source.json").write_text('{"scans": [3]}')
+    assert "damaged (ValueError: scans must be two" in lidarflow.complaint("eval", "run")
     (run / "source.json").write_text("{")
     assert "damaged" in lidarflow.complaint("eval", "run")
