@@ -22,13 +22,15 @@ import tomli_w
 from lidarflow import pose
 from lidarflow.config import Config, to_dict
 from lidarflow.errors import DataError
-from lidarflow.types import FlowResult
+from lidarflow.types import FlowResult, SolveStats
 
 FLOW_FOLDER = "flow"
 CONFIG_FILE = "config.toml"
+SOURCE_FILE = "source.json"
+METRICS_FILE = "metrics.json"
 RECORDING_FILE = "recording.rrd"
 OBJECTS_FILE = "objects.csv"
-RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", "metrics.json", "timing.json", OBJECTS_FILE,
+RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", METRICS_FILE, "timing.json", SOURCE_FILE, OBJECTS_FILE,
                 RECORDING_FILE, "preview.png")
 OBJECT_COLUMNS = ("frame", "id", "points", "x", "y", "z", "length", "width", "height", "yaw",
                   "vx", "vy", "vz", "speed_m_per_s")
@@ -36,7 +38,8 @@ LATEST = "latest"
 
 # name: (shape, after N for the arrays with a row per point; dtype kind)
 _ROW_ARRAYS = {"flow": ((3,), "f"), "points": ((3,), "f"), "motion": ((7,), "f"), "valid": ((), "b"),
-               "in_graph": ((), "b"), "is_dynamic": ((), "b"), "object": ((), "i"), "std": ((), "f")}
+               "in_graph": ((), "b"), "is_dynamic": ((), "b"), "is_ground": ((), "b"), "object": ((), "i"),
+               "std": ((), "f")}
 _WHOLE_ARRAYS = {"ego_motion": ((4, 4), "f"), "config": ((), "U"), "stats": ((), "U")}
 
 
@@ -50,6 +53,7 @@ class FlowFile:
     valid       (N,) bool          the motion rests on evidence
     in_graph    (N,) bool          the motion was solved for
     is_dynamic  (N,) bool          moves over ground by itself
+    is_ground   (N,) bool          ground of the static world
     object_id   (N,) int32         the moving object the point is on, -1 = none
     std_m       (N,) float32       standard deviation of the flow, metres; NaN = unknown
     ego_motion  (4, 4) float64     target_from_source of the static world
@@ -63,11 +67,18 @@ class FlowFile:
     valid: np.ndarray
     in_graph: np.ndarray
     is_dynamic: np.ndarray
+    is_ground: np.ndarray
     object_id: np.ndarray
     std_m: np.ndarray
     ego_motion: np.ndarray
     config: dict
     stats: dict
+
+    def result(self) -> FlowResult:
+        """The answer that the file holds, to 32-bit accuracy; without matches, boxes of objects and times."""
+        return FlowResult(
+            self.flow.astype(np.float64), self.motions, self.valid, self.in_graph, self.is_dynamic,
+            self.ego_motion, SolveStats(**self.stats), is_ground=self.is_ground, object_id=self.object_id)
 
 
 @contextlib.contextmanager
@@ -106,6 +117,7 @@ def save_flow(path: Path, points: np.ndarray, result: FlowResult, config: Config
         "valid": result.valid,
         "in_graph": result.in_graph,
         "is_dynamic": result.is_dynamic,
+        "is_ground": result.is_ground,
         "object": result.object_id.astype(np.int32),
         "std": result.std_m.astype(np.float32),
         "ego_motion": result.ego_motion.astype(np.float64),
@@ -135,7 +147,8 @@ def load_flow(path: Path) -> FlowFile:
     if not pose.is_rigid(ego_motion, 1e-4) or not isinstance(config, dict) or not isinstance(stats, dict):
         raise DataError(f"{path}: damaged flow file; its ego_motion, config or stats make no sense")
     return FlowFile(arrays["points"], arrays["flow"], motions, arrays["valid"], arrays["in_graph"],
-                    arrays["is_dynamic"], arrays["object"], arrays["std"], ego_motion, config, stats)
+                    arrays["is_dynamic"], arrays["is_ground"], arrays["object"], arrays["std"], ego_motion,
+                    config, stats)
 
 
 def write_poses_kitti(path: Path, world_from_sensor: np.ndarray) -> None:

@@ -2,17 +2,18 @@
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, metrics, pipeline, pose, preview
+from lidarflow import io, metrics, pipeline, pose, preview, provenance
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.errors import DataError, LidarflowError
-from lidarflow.types import FlowResult, ScanPair, SolveStats, Truth
+from lidarflow.types import FlowResult, Scan, ScanPair, SolveStats, Truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,19 +32,24 @@ class Viewing:
 
 @dataclass(frozen=True, slots=True)
 class PairReport:
-    """What is known of one pair once it is done: scores are None where there is no truth."""
+    """What is known of one pair once it is done; scores are None where there is no truth.
+
+    matches      None where only the flow file is left, which does not hold them
+    valid_share  how many of the points have a motion that rests on evidence
+    """
 
     frame: str
     points: int
     graph_points: int
     moving_points: int
     objects: int
-    matches: int
+    matches: int | None
     alignment: metrics.Alignment
     scores: metrics.Scores | None
     truth: str
     stats: SolveStats
     seconds: dict[str, float]
+    valid_share: float = float("nan")
 
 
 def choose_frames(dataset: Dataset, jump: int, count: int | None) -> list[int]:
@@ -76,6 +82,7 @@ def process(
     first = next(results)
     io.new_run_folder(out)
     io.write_toml(out / io.CONFIG_FILE, config)
+    provenance.write(out, provenance.RunSource(dataset.source, tuple(frames)))
     world_from_sensor, times_ns, objects = [np.eye(4)], [], []
     with _recording(out / io.RECORDING_FILE, viewing) as stream:
         for index, (pair, result) in zip(frames, _chained(first, results), strict=False):
@@ -99,32 +106,64 @@ def process(
     io.write_objects(out / io.OBJECTS_FILE, objects)
     with io.written_aside(out / "preview.png") as aside:
         preview.write_preview(aside, pair, result)
-    io.write_json(out / "metrics.json", metrics_of(reports, config))
+    io.write_json(out / io.METRICS_FILE, metrics_of(reports, config))
     io.write_json(out / "timing.json", {r.frame: r.seconds for r in reports})
     io.link_latest(out)
     return reports
 
 
 def metrics_of(reports: list[PairReport], config: Config) -> dict:
-    """What metrics.json holds: the mean over pairs, and every pair; wall times are kept elsewhere."""
-    pairs = []
-    for report in reports:
-        values = asdict(report)
-        del values["seconds"]
-        pairs.append(values)
-    return {"crispness_sigma_m": config.crispness.sigma_m, "mean": mean_of(reports), "pairs": pairs}
+    """What metrics.json holds; wall times are kept elsewhere, so that equal runs are equal.
+
+    mean, std  of the figures of every pair, over pairs
+    three_way, bucketed, by_range, by_speed   over the points of all pairs, where all of them have a truth
+    pairs      what is known of every pair
+    """
+    spread = _over_pairs(reports)
+    scored = [report.scores for report in reports if report.scores is not None]
+    whole = metrics.pool(scored) if scored and len(scored) == len(reports) else None
+    return {
+        "crispness_sigma_m": config.crispness.sigma_m,
+        "truth": truth_of(reports),
+        "mean": {name: mean for name, (mean, _) in spread.items()},
+        "std": {name: std for name, (_, std) in spread.items()},
+        **({} if whole is None else _plain_pooled(whole)),
+        "pairs": [_plain_pair(report) for report in reports],
+    }
 
 
 def mean_of(reports: list[PairReport]) -> dict[str, float]:
     """Means over pairs of the main figures; figures without a value in a pair leave that pair out."""
+    return {name: mean for name, (mean, _) in _over_pairs(reports).items()}
+
+
+def truth_of(reports: list[PairReport]) -> str:
+    """What the pairs were scored against, e.g. "flow" or "flow (4 pairs), none (1)"."""
+    counts = Counter(report.truth for report in reports)
+    if len(counts) == 1:
+        return reports[0].truth
+    return ", ".join(f"{origin} ({count} pairs)" for origin, count in counts.items())
+
+
+def _over_pairs(reports: list[PairReport]) -> dict[str, tuple[float, float]]:
+    """Mean and standard deviation of every figure that some pair has a value of."""
     rows = [figures_of(report) for report in reports]
     names = dict.fromkeys(name for row in rows for name in row)
-    means = {}
-    for name in names:
-        values = np.array([row[name] for row in rows if name in row and np.isfinite(row[name])])
-        if len(values):
-            means[name] = float(values.mean())
-    return means
+    found = {name: metrics.over_frames(row[name] for row in rows if name in row) for name in names}
+    return {name: (mean, std) for name, (mean, std) in found.items() if np.isfinite(mean)}
+
+
+def _plain_pair(report: PairReport) -> dict:
+    values = asdict(report)
+    del values["seconds"]
+    if values["scores"] is not None:
+        del values["scores"]["buckets"]     # sums to be pooled, nothing to be read
+    return values
+
+
+def _plain_pooled(whole: metrics.Pooled) -> dict:
+    three_way = {"mean_m": whole.three_way.mean_m, "dynamic_iou": whole.three_way.dynamic_iou}
+    return {**asdict(whole), "three_way": {**three_way, **asdict(whole.three_way)}}
 
 
 def figures_of(report: PairReport) -> dict[str, float]:
@@ -133,32 +172,26 @@ def figures_of(report: PairReport) -> dict[str, float]:
         "crispness_before": report.alignment.before,
         "crispness_by_ego": report.alignment.by_ego,
         "crispness_after": report.alignment.after,
+        "valid_share": report.valid_share,
         "moving_points": float(report.moving_points),
         "objects": float(report.objects),
     }
     if report.scores is not None:
-        s = report.scores
-        figures |= {
-            "epe_all_m": s.all.mean, "epe_static_m": s.static.mean, "epe_dynamic_m": s.dynamic.mean,
-            "epe_dynamic_median_m": s.dynamic.median, "graph_epe_static_m": s.graph_static.mean,
-            "graph_epe_dynamic_m": s.graph_dynamic.mean,
-            "graph_epe_dynamic_median_m": s.graph_dynamic.median, "t_e_m": s.t_e, "r_e_rad": s.r_e_rad,
-            "movers_found": s.movers_found, "false_movers": s.false_movers, "ego_error_m": s.ego_error_m,
-            "ego_error_deg": float(np.degrees(s.ego_error_rad)),
-        }
+        figures |= metrics.figures(report.scores)
     return figures
 
 
 def find_truth(dataset: Dataset, index: int, pair: ScanPair) -> tuple[Truth | None, str]:
-    """Truth of the pair at `index`, and where it comes from: "flow", "poses" or "none"."""
+    """Truth of the pair at `index`, and what it was made of: "flow", "boxes", "poses", … or "none"."""
     truth = dataset.truth(index)
     if truth is not None:
-        return truth, "flow"
+        return truth, truth.origin
     world_from_sensor = dataset.world_from_sensor()
     if world_from_sensor is None:
         return None, "none"
     ego_motion = pose.inverse(world_from_sensor[index + 1]) @ world_from_sensor[index]
-    return metrics.static_truth(pair.source.points, ego_motion), "poses (every point taken as static)"
+    truth = metrics.static_truth(pair.source.points, ego_motion)
+    return truth, truth.origin
 
 
 def report_pair(
@@ -166,18 +199,28 @@ def report_pair(
 ) -> PairReport:
     """Scores of a finished pair, the one from the data set's scan `index` to the next."""
     truth, origin = find_truth(dataset, index, pair)
+    alignment = metrics.alignment(pair.source, pair.target, result, config.crispness.sigma_m)
+    return report_result(pair.source, result, len(result.match_source), alignment, truth, origin)
+
+
+def report_result(
+    source: Scan, result: FlowResult, matches: int | None, alignment: metrics.Alignment,
+    truth: Truth | None, origin: str,
+) -> PairReport:
+    """Scores of the flow of `source`; `origin` says what its truth was made of."""
     return PairReport(
-        frame=pair.source.name,
-        points=len(pair.source),
+        frame=source.name,
+        points=len(source),
         graph_points=int((result.in_graph & result.valid).sum()),
         moving_points=int(result.is_dynamic.sum()),
-        objects=len(result.objects),
-        matches=len(result.match_source),
-        alignment=metrics.alignment(pair.source, pair.target, result, config.crispness.sigma_m),
-        scores=None if truth is None else metrics.score(pair.source.points, result, truth),
+        objects=len(np.unique(result.object_id[result.object_id >= 0])),
+        matches=matches,
+        alignment=alignment,
+        scores=None if truth is None else metrics.score(source.points, result, truth),
         truth=origin,
         stats=result.stats,
         seconds=result.seconds,
+        valid_share=metrics.mean_of(result.valid[np.isfinite(source.points).all(axis=1)]),
     )
 
 

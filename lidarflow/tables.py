@@ -7,7 +7,7 @@ from rich.table import Table
 from lidarflow import pose
 from lidarflow.config import Config, describe
 from lidarflow.metrics import Alignment
-from lidarflow.runner import PairReport, figures_of, mean_of
+from lidarflow.runner import PairReport, figures_of, mean_of, truth_of
 from lidarflow.types import FlowResult, ScanPair
 
 _COLUMNS = {
@@ -37,14 +37,17 @@ def run_table(reports: list[PairReport], config: Config) -> Table:
     table.add_column("scan", overflow="fold")
     for name in shown:
         table.add_column(_COLUMNS[name], justify="right", no_wrap=True)
-    table.add_column("time\n[s]", justify="right", no_wrap=True)
-    for report, row in zip(reports, rows, strict=True):
+    seconds = [sum(report.seconds.values()) for report in reports]
+    timed = any(seconds)     # results that were read from files are not
+    if timed:
+        table.add_column("time\n[s]", justify="right", no_wrap=True)
+    for report, row, spent in zip(reports, rows, seconds, strict=True):
         table.add_row(report.frame, *(_text(name, row.get(name)) for name in shown),
-                      f"{sum(report.seconds.values()):.1f}")
+                      *([f"{spent:.1f}"] if timed else []))
     mean = mean_of(reports)
-    seconds = np.mean([sum(report.seconds.values()) for report in reports])
     table.add_section()
-    table.add_row("mean", *(_text(name, mean.get(name)) for name in shown), f"{seconds:.1f}")
+    table.add_row("mean", *(_text(name, mean.get(name)) for name in shown),
+                  *([f"{np.mean(seconds):.1f}"] if timed else []))
     return table
 
 
@@ -56,14 +59,14 @@ def run_notes(reports: list[PairReport], config: Config) -> list[str]:
     else:
         graph = [] if config.objects.enabled else [
             "graph: the same of the points the graph solved; others have the ego-motion"]
-        notes = [f"truth: {reports[0].truth}", "EPE: mean end-point error of all points", *graph, *notes]
+        notes = [f"truth: {truth_of(reports)}", "EPE: mean end-point error of all points", *graph, *notes]
     for report in reports:
         doubt = _doubt(report.matches, report.alignment)
         notes += [f"{report.frame}: {doubt}"] if doubt else []
     return notes
 
 
-def _doubt(matches: int, alignment: Alignment) -> str:
+def _doubt(matches: int | None, alignment: Alignment) -> str:
     """What makes a result doubtful, "" for nothing."""
     if matches == 0:
         return "no point found a match, so all of them have the ego-motion"

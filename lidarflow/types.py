@@ -5,6 +5,7 @@ radians, times integer nanoseconds.
 """
 
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
 
@@ -66,6 +67,20 @@ class ScanPair:
         return dt if dt > 0 else 0.1
 
 
+class Category(IntEnum):
+    """What a labelled point is on, in the classes of the bucketed metric (Khatri et al. 2024).
+
+    OTHER is labelled too, but is none of these: animals, signs, barriers.
+    """
+
+    BACKGROUND = 0
+    CAR = 1
+    OTHER_VEHICLES = 2
+    PEDESTRIAN = 3
+    WHEELED_VRU = 4
+    OTHER = 5
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
     """What really happened between a scan and the next, rows aligned with the source scan.
@@ -75,6 +90,9 @@ class Truth:
     valid       (N,) bool      rows that are known and count in scores
     is_dynamic  (N,) bool      the point moves over ground
     object_id   (N,) int       id of the object the point is on, -1 = background
+    category    (N,) int       a Category each; None = not known
+    is_ground   (N,) bool      the point is on the ground; none when not given
+    origin      str            what it was made of, e.g. "flow" or "boxes"
     """
 
     flow: np.ndarray
@@ -82,14 +100,33 @@ class Truth:
     valid: np.ndarray
     is_dynamic: np.ndarray
     object_id: np.ndarray
+    category: np.ndarray | None = None
+    is_ground: np.ndarray | None = None
+    origin: str = "flow"
 
     def __post_init__(self):
         _check("Truth.flow", self.flow, (None, 3), "f")
         n = len(self.flow)
+        if self.is_ground is None:
+            object.__setattr__(self, "is_ground", np.zeros(n, bool))
+        if self.category is not None:
+            _check("Truth.category", self.category, (n,), "iu")
+            if not np.isin(self.category, list(Category)).all():
+                raise ValueError(f"Truth.category: expected numbers of {', '.join(c.name for c in Category)}")
+        _check("Truth.is_ground", self.is_ground, (n,), "b")
         _check("Truth.valid", self.valid, (n,), "b")
         _check("Truth.is_dynamic", self.is_dynamic, (n,), "b")
         _check("Truth.object_id", self.object_id, (n,), "i")
         _check_motion("Truth.ego_motion", self.ego_motion)
+
+    @property
+    def is_foreground(self) -> np.ndarray:
+        """Points (N,) on labelled objects, standing or moving."""
+        return self.object_id >= 0 if self.category is None else self.category != Category.BACKGROUND
+
+    def residual_flow(self, points: np.ndarray) -> np.ndarray:
+        """Flow (N, 3) in metres that `points` (N, 3), the source scan's, do by themselves."""
+        return self.flow - (pose.apply(self.ego_motion, points) - points)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,13 @@ from lidarflow.datasets import open_dataset
 
 SCORES = {
     "epe_all_m": "all", "epe_static_m": "static", "epe_dynamic_m": "moving",
-    "epe_dynamic_median_m": "moving, median", "graph_epe_static_m": "graph static",
+    "epe_dynamic_median_m": "moving, median",
+    "dynamic_error_over_speed": "moving, error over speed", "strict_accuracy": "strict accuracy",
+    "strict_accuracy_static": "strict, static", "strict_accuracy_dynamic": "strict, moving",
+    "epe_foreground_dynamic_m": "foreground dynamic", "epe_foreground_static_m": "foreground static",
+    "epe_background_static_m": "background static", "epe_three_way_m": "three-way",
+    "dynamic_iou": "dynamic IoU", "bucketed_static_m": "bucketed static",
+    "bucketed_dynamic": "bucketed moving", "graph_epe_static_m": "graph static",
     "graph_epe_dynamic_m": "graph moving", "graph_epe_dynamic_median_m": "graph moving, median",
     "t_e_m": "t_e [m]", "r_e_rad": "r_e [rad]", "ego_error_m": "ego [m]", "ego_error_deg": "ego [deg]",
     "movers_found": "movers found", "false_movers": "false movers",

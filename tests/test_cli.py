@@ -30,7 +30,7 @@ from lidarflow import (
 CONTRACT = {"flow": ("float32", (3,)), "motion": ("float32", (7,)), "valid": ("bool", ()),
             "is_dynamic": ("bool", ()), "object": ("int32", ())}
 RUN_FILES = {"config.toml", "flow", "metrics.json", "objects.csv", "poses_kitti.txt", "poses_tum.txt",
-             "preview.png", "recording.rrd", "timing.json"}
+             "preview.png", "recording.rrd", "source.json", "timing.json"}
 RUNS_THE_SAME = ("config.toml", "metrics.json", "objects.csv", "poses_kitti.txt", "poses_tum.txt",
                  "preview.png", "flow/000000.npz", "flow/000001.npz")
 PROGRAM = [sys.executable, "-c", "from lidarflow.cli import main; main()"]
@@ -92,7 +92,7 @@ def test_help_and_version_load_nothing_heavy():
 
 def test_help_names_every_command(lidarflow):
     out = lidarflow.ok("--help")
-    for name in ("pair", "run", "view", "demo", "config"):
+    for name in ("pair", "run", "eval", "view", "demo", "config"):
         assert f"\n  {name} " in out
         assert all(len(line) <= 80 for line in lidarflow.ok(name, "--help").splitlines())
     assert "..." not in out.split("Commands:")[1]
@@ -241,6 +241,21 @@ def test_metrics_of_a_run_are_scores_against_the_truth(finished):
     assert "seconds" not in json.dumps(scored), "wall times would make equal runs differ"
 
 
+def test_a_run_can_be_scored_again(lidarflow, finished, tmp_path):
+    lidarflow.ok("eval", finished[0], "--out", tmp_path / "again.json")
+    first, again = (json.loads(file.read_text())
+                    for file in (finished[0] / "metrics.json", tmp_path / "again.json"))
+    assert again["mean"].keys() == first["mean"].keys() and again["truth"] == first["truth"] == "flow"
+    for name, value in first["mean"].items():
+        assert again["mean"][name] == pytest.approx(value, abs=2e-5), name
+    assert again["by_range"][0]["all"]["points"] == first["by_range"][0]["all"]["points"]
+    assert [pair.keys() for pair in again["pairs"]] == [pair.keys() for pair in first["pairs"]]
+    for now, then in zip(again["pairs"], first["pairs"], strict=True):
+        same = {"frame", "points", "graph_points", "moving_points", "objects", "truth", "stats"}
+        assert {name: now[name] for name in same} == {name: then[name] for name in same}
+        assert now["matches"] is None and then["matches"] > 0, "a flow file does not hold the matches"
+
+
 def test_a_run_says_what_it_read_and_wrote_within_80_columns(finished):
     out, done = finished
     assert done.stderr == "", "no library may talk, no bar where there is no terminal"
@@ -259,7 +274,9 @@ def test_the_widest_table_fits_80_columns(monkeypatch, capsys, enabled):
     """Up to ten columns, with the names and figures of a long drive; the graph's only without objects."""
     alignment = metrics.Alignment(0.741, 0.9, 0.969, 0.2)
     summary = metrics.ErrorSummary(100, 12.345, 1.2)
-    scores = metrics.Scores(*[summary] * 5, 0.1, 0.1, 1.0, 1.0, 0.1, 0.1)
+    part = metrics.MeanError(100, 0.1)
+    scores = metrics.Scores(*[summary] * 5, *[metrics.Accuracy(*[0.1] * 5)] * 3,
+                            metrics.ThreeWay(part, part, part, 1, 1, 1), None, (), (), *[0.1] * 7)
     reports = [runner.PairReport(name, 123456, 5000, 123456, 42, 999, alignment, scores, "flow", None,
                                  {"all": 999.9})
                for name in ("0000000000", "315966265259836000")]

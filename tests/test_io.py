@@ -30,11 +30,11 @@ def some_result(count=5, seconds=1.0):
     motions = pose.exp(rng.normal(size=(count, 6)) * 0.3)
     flow = pose.apply(motions, points) - points
     points[1] = flow[1] = np.nan
-    valid, in_graph, is_dynamic = rng.random((3, count)) < 0.5
+    valid, in_graph, is_dynamic, is_ground = rng.random((4, count)) < 0.5
     result = FlowResult(flow=flow, motions=motions, valid=valid, in_graph=in_graph,
                         is_dynamic=is_dynamic, ego_motion=pose.from_yaw(0.1, (1, 2, 3)),
                         stats=some_stats(), seconds={"solve": seconds},
-                        object_id=np.arange(-1, count - 1))
+                        object_id=np.arange(-1, count - 1), is_ground=is_ground)
     return points, result
 
 
@@ -60,10 +60,13 @@ def test_a_flow_file_comes_back(saved):
     np.testing.assert_allclose(loaded.points, points, rtol=1e-6)
     np.testing.assert_allclose(loaded.flow, result.flow, rtol=1e-5)
     np.testing.assert_allclose(loaded.motions, result.motions, atol=1e-5)
-    for name in ("valid", "in_graph", "is_dynamic", "object_id", "ego_motion"):
+    back = loaded.result()
+    for name in ("valid", "in_graph", "is_dynamic", "is_ground", "object_id", "ego_motion"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(result, name))
+        np.testing.assert_array_equal(getattr(back, name), getattr(result, name))
     assert settings.updated(Config(), loaded.config) == Config()
-    assert SolveStats(**loaded.stats) == result.stats
+    assert SolveStats(**loaded.stats) == back.stats == result.stats
+    np.testing.assert_allclose(back.flow, result.flow, rtol=1e-5)
 
 
 def test_a_flow_file_is_the_stable_contract(saved):
@@ -71,10 +74,11 @@ def test_a_flow_file_is_the_stable_contract(saved):
         found = {name: (archive[name].shape, archive[name].dtype.kind) for name in archive.files}
         dtypes = {name: archive[name].dtype for name in ("flow", "motion", "object", "ego_motion")}
     assert found["config"][1] == found["stats"][1] == "U"
-    assert found["valid"][1] == found["in_graph"][1] == found["is_dynamic"][1] == "b"
+    assert {found[name][1] for name in ("valid", "in_graph", "is_dynamic", "is_ground")} == {"b"}
     assert {name: shape for name, (shape, _) in found.items()} == {
         "points": (5, 3), "flow": (5, 3), "motion": (5, 7), "valid": (5,), "in_graph": (5,),
-        "is_dynamic": (5,), "object": (5,), "std": (5,), "ego_motion": (4, 4), "config": (), "stats": ()}
+        "is_dynamic": (5,), "is_ground": (5,), "object": (5,), "std": (5,), "ego_motion": (4, 4),
+        "config": (), "stats": ()}
     assert dtypes == {"flow": np.float32, "motion": np.float32, "object": np.int32, "ego_motion": np.float64}
 
 

@@ -15,8 +15,10 @@ LAYERS = [
     {"lidar", "rgbd", "solve", "datasets", "synthetic", "baselines"},
     {"pipeline"},
     {"metrics", "io", "viewer", "preview"},
+    {"provenance"},
     {"runner"},
-    {"tables", "demo"},
+    {"evaluation"},
+    {"tables", "score_tables", "demo"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarflow import metrics, pose
-from lidarflow.types import FlowResult, Scan, SolveStats, Truth
+from lidarflow.types import Category, FlowResult, Scan, SolveStats, Truth
 
 STATS = SolveStats("none", 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0, {})
 SIGMA_M = 0.2
@@ -53,6 +53,14 @@ def test_eight_rows_are_scored_as_by_hand():
     assert scores.movers_found == pytest.approx(1 / 2)
     assert scores.false_movers == pytest.approx(1 / 4)
     assert scores.ego_error_m == pytest.approx(0.5) and scores.ego_error_rad == pytest.approx(0.0)
+    assert scores.dynamic_error_over_speed == pytest.approx(2.0 / 2.0), "mean error 2 m, and 2 m a frame"
+    assert (scores.accuracy_all.strict, scores.accuracy_static.strict) == pytest.approx((1 / 6, 1 / 4))
+    assert scores.accuracy_dynamic.strict == 0.0
+    three_way = scores.three_way
+    assert three_way.foreground_dynamic == metrics.MeanError(2, 2.0)
+    assert three_way.background_static.mean == pytest.approx(0.3)
+    assert three_way.foreground_static.points == 0 and np.isnan(three_way.mean_m)
+    assert three_way.dynamic_iou == pytest.approx(1 / 3), "row 4 of rows 1, 4 and 5"
 
 
 def test_without_movers_their_scores_are_nan_and_the_rest_stays():
@@ -98,6 +106,30 @@ def test_alignment_looks_at_known_points_above_ground_alone():
     found = metrics.alignment(Scan(points), target, result, SIGMA_M)
     assert (found.before, found.by_ego, found.after) == pytest.approx((np.exp(-1), np.exp(-0.25), 1.0))
     assert found.sigma_m == SIGMA_M
+
+
+def test_frames_have_a_mean_and_a_deviation():
+    assert metrics.over_frames([0.1, 0.3, np.nan]) == pytest.approx((0.2, 0.1))
+    assert metrics.over_frames(iter([0.5])) == (0.5, 0.0)
+    assert np.isnan(metrics.over_frames([np.nan])).all()
+
+
+def test_figures_say_in_their_names_what_they_are():
+    points, result, truth = eight_rows()
+    scores = metrics.score(points, result, truth)
+    found = metrics.figures(scores)
+    assert (found["epe_dynamic_median_m"], found["ego_error_deg"]) == pytest.approx((2.0, 0.0))
+    assert (found["strict_accuracy"], found["strict_accuracy_dynamic"]) == (pytest.approx(1 / 6), 0.0)
+    assert found["dynamic_iou"] == pytest.approx(1 / 3) and "bucketed_dynamic" not in found
+    by_class = np.where(truth.is_dynamic, Category.CAR, Category.BACKGROUND)
+    with_classes = metrics.score(points, result, replace(truth, category=by_class))
+    found = metrics.figures(with_classes)
+    assert found["bucketed_static_m"] == pytest.approx(0.3), "the four static rows of the background"
+    assert found["bucketed_dynamic"] == pytest.approx(2.0 / 2.0)
+    whole = metrics.pool([with_classes, with_classes])
+    assert whole.bucketed.classes["CAR"].dynamic == pytest.approx(1.0)
+    assert whole.by_range[0].all == metrics.MeanError(12, scores.all.mean)
+    assert metrics.pool([with_classes, scores]).bucketed is None, "classes of one pair are not known"
 
 
 def test_pose_errors_are_means_over_points():

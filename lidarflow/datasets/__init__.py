@@ -5,18 +5,20 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from lidarflow.datasets import argoverse2, clouds, kitti, range_images
-from lidarflow.datasets.base import Dataset
+from lidarflow.datasets import argoverse2, clouds, kitti, kitti_tracking, range_images
+from lidarflow.datasets.base import Dataset, Source
 from lidarflow.datasets.clouds import read_points, read_scan
 from lidarflow.datasets.folder import kitti_scan_folder
 from lidarflow.datasets.kiss import KissLoader
 from lidarflow.errors import DataError, InstallError
 
-__all__ = ["LOADERS", "Dataset", "guess_loader", "loader_names", "open_dataset", "read_points", "read_scan"]
+__all__ = ["LOADERS", "Dataset", "Source", "guess_loader", "loader_names", "open_dataset", "read_points",
+           "read_scan"]
 
 LOADERS = {
     "kitti": "lidarflow.datasets.kitti:KittiOdometry",
     "kitti_raw": "lidarflow.datasets.folder:KittiRaw",
+    "kitti_tracking": "lidarflow.datasets.kitti_tracking:KittiTracking",
     "argoverse2": "lidarflow.datasets.argoverse2:Argoverse2",
     "range_images": "lidarflow.datasets.range_images:RangeImages",
     "folder": "lidarflow.datasets.folder:CloudFolder",
@@ -39,14 +41,9 @@ def open_dataset(folder: Path, dataloader: str | None = None, sequence: str | No
     if dataloader in (None, "kitti", "kitti_raw"):
         dataloader = dataloader or guess_loader(folder)
         folder = _data_root(folder)
-    if dataloader not in LOADERS:
-        if dataloader not in loader_names():
-            raise DataError(f"unknown loader '{dataloader}'{_nearest(dataloader)}")
-        return KissLoader(dataloader, folder, sequence, kitti_correction)
-    if not folder.is_dir():
-        raise DataError(_not_a_folder(folder))
-    module, _, name = LOADERS[dataloader].partition(":")
-    return getattr(importlib.import_module(module), name)(folder, sequence, kitti_correction)
+    dataset = _opened(folder, dataloader, sequence, kitti_correction)
+    dataset.source = Source(folder.resolve(), dataloader, sequence, kitti_correction)
+    return dataset
 
 
 def loader_names() -> list[str]:
@@ -73,6 +70,8 @@ def guess_loader(folder: Path) -> str:
     suffixes = {file.suffix.lower() for file in clouds.visible_files(root)}
     if kitti.sequence_folders(root) or ((root / "velodyne").is_dir() and (root / "calib.txt").is_file()):
         return "kitti"
+    if kitti_tracking.is_sequence(root) or kitti_tracking.sequence_folders(root):
+        return "kitti_tracking"
     if kitti_scan_folder(root) is not None:
         return "kitti_raw"
     if argoverse2.is_log(root) or argoverse2.log_folders(root):
@@ -84,6 +83,17 @@ def guess_loader(folder: Path) -> str:
             return "rosbag"
         clouds.list_clouds(root)     # says what was found instead
     return "folder"
+
+
+def _opened(folder: Path, dataloader: str, sequence: str | None, kitti_correction: str) -> Dataset:
+    if dataloader not in LOADERS:
+        if dataloader not in loader_names():
+            raise DataError(f"unknown loader '{dataloader}'{_nearest(dataloader)}")
+        return KissLoader(dataloader, folder, sequence, kitti_correction)
+    if not folder.is_dir():
+        raise DataError(_not_a_folder(folder))
+    module, _, name = LOADERS[dataloader].partition(":")
+    return getattr(importlib.import_module(module), name)(folder, sequence, kitti_correction)
 
 
 def _data_root(folder: Path) -> Path:

@@ -1,19 +1,22 @@
-"""Argoverse 2 sensor logs: sweeps and poses as .feather tables."""
+"""Argoverse 2 sensor logs: sweeps, poses and labelled boxes as .feather tables."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.datasets import clouds
+from lidarflow.datasets import argoverse2_map, clouds
 from lidarflow.datasets.base import ScanFiles
+from lidarflow.datasets.boxes import Box, box_around, truth_of_boxes
+from lidarflow.datasets.categories import categories_of_argoverse2, category_of
 from lidarflow.datasets.kitti_correction import is_wanted
 from lidarflow.errors import DataError, InstallError
-from lidarflow.types import Truth
+from lidarflow.types import Category, Truth
 
 SPLITS = ("val", "train", "test")
-BOX_MARGIN_M = 0.1
+BOX_MARGIN_M = (0.1, 0.1, 0.0)     # the official labels widen a box by 0.2 m in length and width
 _POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
 _SIZE_COLUMNS = ("length_m", "width_m", "height_m")
 _FLOW_COLUMNS = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
@@ -24,7 +27,8 @@ class Argoverse2(ScanFiles):
 
     Sweeps are in the frame of the vehicle, times come from the file names and poses from
     city_SE3_egovehicle.feather. Truth of the first pair comes from FOLDER/truth/flow_labels.feather
-    where there is such a file; ground does not count in it.
+    where there is such a file, of all others from the boxes in annotations.feather; ground does not count in
+    it. The log's map tells what is ground where there is one.
     """
 
     loader = "argoverse2"
@@ -40,25 +44,15 @@ class Argoverse2(ScanFiles):
                          notes=["points are stored as float16, 3 cm steps beyond 32 m"])
 
     def truth(self, index: int) -> Truth | None:
-        """The labelled flow of the first sweep where the folder has it."""
-        file = self.folder.absolute().parent.parent / "truth" / "flow_labels.feather"
+        """The official flow of the first sweep where the folder has it, else flow from the labelled boxes."""
         poses = self.world_from_sensor()
-        if index != 0 or len(self) < 2 or poses is None or not file.is_file():
+        if not 0 <= index < len(self) - 1 or poses is None:
             return None
-        labels = read_columns(file, (*_FLOW_COLUMNS, "classes", "dynamic", "is_ground_0"))
-        points = self._read(self.files[0])
-        rows = len(labels["classes"])
-        if rows != len(points):
-            raise DataError(f"{file}: {rows} rows, but {self.files[0].name} has {len(points)} points; "
-                            "expected one row per point")
-        flow = np.stack([labels[name] for name in _FLOW_COLUMNS], axis=1).astype(np.float64)
-        return Truth(
-            flow=flow,
-            ego_motion=pose.inverse(poses[1]) @ poses[0],
-            valid=np.isfinite(flow).all(axis=1) & ~labels["is_ground_0"].astype(bool),
-            is_dynamic=labels["dynamic"].astype(bool),
-            object_id=np.where(labels["classes"] > 0, self._boxes_of(points, self.times_ns[0]), -1),
-        )
+        ego_motion = pose.inverse(poses[index + 1]) @ poses[index]
+        file = self.folder.absolute().parent.parent / "truth" / "flow_labels.feather"
+        if index == 0 and file.is_file():
+            return self._official_truth(file, ego_motion)
+        return self._truth_of_boxes(index, ego_motion, poses[index])
 
     def world_from_sensor(self) -> np.ndarray | None:
         """Poses (N, 4, 4) of the vehicle in the city's frame; None where a sweep has none."""
@@ -70,6 +64,18 @@ class Argoverse2(ScanFiles):
         picked = [row_at.get(time) for time in self.times_ns]
         return None if None in picked else _motions(file, table)[picked]
 
+    def boxes(self, *indices: int) -> list[list[Box]]:
+        """The labelled boxes of each of the sweeps; none where they are not labelled."""
+        file = self.folder / "annotations.feather"
+        if not file.is_file():
+            return [[] for _ in indices]
+        table = read_columns(file, ("timestamp_ns", "track_uuid", "category", *_SIZE_COLUMNS, *_POSE_COLUMNS))
+        _, track = np.unique(table["track_uuid"].astype(str), return_inverse=True)
+        motions, size = _motions(file, table), np.stack([table[name] for name in _SIZE_COLUMNS], axis=1)
+        return [[Box(int(track[row]), category_of(table["category"][row]), motions[row], size[row])
+                 for row in np.flatnonzero(table["timestamp_ns"] == self.times_ns[index])]
+                for index in indices]
+
     def _read(self, file: Path) -> np.ndarray:
         table = read_columns(file, ("x", "y", "z"))
         points = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
@@ -77,20 +83,44 @@ class Argoverse2(ScanFiles):
             raise DataError(f"{file}: empty scan (no finite point among {len(points)}); leave this file out")
         return points
 
-    def _boxes_of(self, points: np.ndarray, time_ns: int) -> np.ndarray:
-        """Number (N,) of the labelled box around each point at `time_ns`, -1 = none."""
-        box = np.full(len(points), -1, dtype=np.int64)
-        file = self.folder / "annotations.feather"
-        if not file.is_file():
-            return box
-        table = read_columns(file, ("timestamp_ns", *_SIZE_COLUMNS, *_POSE_COLUMNS))
-        rows = np.flatnonzero(table["timestamp_ns"] == time_ns)
-        half = np.stack([table[name] for name in _SIZE_COLUMNS], axis=1) / 2 + BOX_MARGIN_M
-        box_from_sensor = pose.inverse(_motions(file, table)[rows])
-        for number, row in enumerate(rows):
-            local = pose.apply(box_from_sensor[number], points)
-            box[(np.abs(local) <= half[row]).all(axis=1)] = number
-        return box
+    def _official_truth(self, file: Path, ego_motion: np.ndarray) -> Truth:
+        labels = read_columns(file, (*_FLOW_COLUMNS, "classes", "dynamic", "is_ground_0"))
+        points = self._read(self.files[0])
+        rows = len(labels["classes"])
+        if rows != len(points):
+            raise DataError(f"{file}: {rows} rows, but {self.files[0].name} has {len(points)} points; "
+                            "expected one row per point")
+        flow = np.stack([labels[name] for name in _FLOW_COLUMNS], axis=1).astype(np.float64)
+        is_ground = labels["is_ground_0"].astype(bool)
+        boxes, = self.boxes(0)
+        track = np.array([*(box.track for box in boxes), -1])[box_around(points, boxes, BOX_MARGIN_M)]
+        category = categories_of_argoverse2(labels["classes"])
+        return Truth(
+            flow=flow,
+            ego_motion=ego_motion,
+            valid=np.isfinite(flow).all(axis=1) & ~is_ground,
+            is_dynamic=labels["dynamic"].astype(bool),
+            object_id=np.where(category != Category.BACKGROUND, track, -1),
+            category=category,
+            is_ground=is_ground,
+            origin="flow (official labels)",
+        )
+
+    def _truth_of_boxes(
+        self, index: int, ego_motion: np.ndarray, city_from_vehicle: np.ndarray
+    ) -> Truth | None:
+        """Flow from the boxes of a sweep and the next, made as the official labels are."""
+        source, target = self.boxes(index, index + 1)
+        if not source or not target:
+            return None
+        points = self._read(self.files[index])
+        row = box_around(points, source, BOX_MARGIN_M)
+        truth = truth_of_boxes(points, row, source, target, ego_motion, "boxes (no map, so ground counts)")
+        is_ground = argoverse2_map.is_ground(self.folder / "map", pose.apply(city_from_vehicle, points))
+        if is_ground is None:
+            return truth
+        return replace(truth, valid=truth.valid & ~is_ground, is_ground=is_ground,
+                       origin="boxes (ground from the map)")
 
 
 def read_columns(file: Path, names: Sequence[str]) -> dict[str, np.ndarray]:

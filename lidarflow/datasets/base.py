@@ -3,6 +3,7 @@
 import itertools
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -14,6 +15,17 @@ from lidarflow.errors import DataError
 from lidarflow.types import Scan, Truth
 
 DEFAULT_PERIOD_NS = 100_000_000
+TRUTH_ARRAYS = ("flow", "valid", "dynamic", "track", "target_from_source")
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """What `open_dataset` opened a data set with, so that it can be opened again."""
+
+    folder: Path
+    loader: str
+    sequence: str | None
+    kitti_correction: str
 
 
 class Dataset(Protocol):
@@ -22,11 +34,13 @@ class Dataset(Protocol):
     name    what messages call it, e.g. "kitti 00"
     loader  the name that `open_dataset` knows it by
     note    what was assumed while opening it, "" for nothing
+    source  set by `open_dataset`, None for a data set that was made in another way
     """
 
     name: str
     loader: str
     note: str
+    source: Source | None
 
     def __len__(self) -> int: ...
 
@@ -49,6 +63,7 @@ class ScanFiles:
     """
 
     loader = "folder"
+    source: Source | None = None
 
     def __init__(self, name: str, files: Sequence[Path], times_ns: Sequence[int] | None = None,
                  correct: bool = False, notes: Sequence[str] = ()):
@@ -64,11 +79,15 @@ class ScanFiles:
 
     def scan(self, index: int) -> Scan:
         """The scan at `index`; DataError where there is none or its file is damaged."""
-        check_index(self, index)
-        points = self._read(self.files[index])
+        points = self.stored_points(index)
         if self.correct:
             points = correct_vertical_angle(points)
         return Scan(points, self.times_ns[index], self.files[index].stem)
+
+    def stored_points(self, index: int) -> np.ndarray:
+        """Points (N, 3) of the scan at `index` as its file holds them, without a correction."""
+        check_index(self, index)
+        return self._read(self.files[index])
 
     def truth(self, index: int) -> Truth | None:
         """Nothing is known unless a loader says otherwise."""
@@ -132,11 +151,23 @@ def load_truth(file: Path, scan_file: Path, next_file: Path) -> Truth | None:
     numbers = frame_number(scan_file), frame_number(next_file)
     if not file.is_file() or None in numbers or numbers[1] != numbers[0] + 1:
         return None
-    arrays = clouds.load_arrays(file, ("flow", "valid", "dynamic", "track", "target_from_source"))
-    rows = len(clouds.read_points(scan_file))
-    if len(arrays["flow"]) != rows:
-        raise DataError(f"{file}: {len(arrays['flow'])} rows, but {scan_file.name} has {rows} points; "
-                        "expected one row per point")
+    return read_truth(file, len(clouds.read_points(scan_file)), scan_file.name)
+
+
+def read_truth(file: Path, rows: int, name: str) -> Truth:
+    """Truth of a scan called `name` with `rows` points from an .npz file.
+
+    It holds flow (N, 3), valid, dynamic, track (N,) and target_from_source (4, 4), and may hold category
+    (numbers of types.Category) and is_ground (N,). Raises DataError where it does not, or is not aligned
+    with the scan.
+    """
+    arrays = clouds.load_arrays(file)
+    missing = [key for key in TRUTH_ARRAYS if key not in arrays]
+    if missing:
+        raise DataError(f"{file}: lacks {', '.join(missing)}; it holds {', '.join(arrays) or 'nothing'}")
+    found = len(arrays["flow"]) if arrays["flow"].ndim else 0
+    if found != rows:
+        raise DataError(f"{file}: {found} rows, but {name} has {rows} points; expected one row per point")
     try:
         return Truth(
             flow=arrays["flow"].astype(np.float64),
@@ -144,6 +175,8 @@ def load_truth(file: Path, scan_file: Path, next_file: Path) -> Truth | None:
             valid=arrays["valid"],
             is_dynamic=arrays["dynamic"],
             object_id=arrays["track"].astype(np.int64),
+            category=arrays.get("category"),
+            is_ground=arrays.get("is_ground"),
         )
     except ValueError as error:
         raise DataError(f"{file}: {clouds.one_line(error)}") from None

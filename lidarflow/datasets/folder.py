@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow.datasets import clouds, tables
+from lidarflow.datasets import clouds, oxts, tables
 from lidarflow.datasets.base import ScanFiles
 from lidarflow.datasets.kitti_correction import is_wanted
+from lidarflow.datasets.kitti_labels import Labels, read_table, read_tracklets
+from lidarflow.datasets.kitti_truth import labelled_truth, with_classes
 from lidarflow.errors import DataError
 from lidarflow.types import Truth
 
@@ -42,8 +44,9 @@ class CloudFolder(ScanFiles):
 class KittiRaw(ScanFiles):
     """A drive as KITTI's raw recordings lay it out: scans in velodyne_points/data, or in velodyne.
 
-    The vertical-angle correction is on for .bin files. Truth, where there is any, lies in
-    truth/<scan>.npz; poses as in CloudFolder.
+    The vertical-angle correction is on for .bin files. Poses as in CloudFolder, else from oxts/data and the
+    date's calib_imu_to_velo.txt. Truth lies in truth/<scan>.npz, else it is made of the labelled boxes in
+    tracklet_labels.xml or boxes.csv, which also tell the classes.
     """
 
     loader = "kitti_raw"
@@ -57,17 +60,32 @@ class KittiRaw(ScanFiles):
         files = clouds.list_clouds(scan_folder)
         times_ns, notes = _read_times(self.folder, files)
         self._poses, pose_notes = _read_poses(self.folder, files)
+        if self._poses is None and not pose_notes:
+            self._poses, pose_notes = _navigated(self.folder, files)
         correct = is_wanted(kitti_correction, files[0].suffix.lower() == ".bin")
         super().__init__(f"kitti_raw {folder_name(self.folder)}", files, times_ns, correct,
                          [*notes, *pose_notes])
 
     def truth(self, index: int) -> Truth | None:
-        """Truth of truth/<scan>.npz where there is such a file."""
-        return self.stored_truth(self.folder / "truth", index)
+        """Truth of truth/<scan>.npz where there is such a file, else flow from labelled boxes and poses."""
+        stored, labels = self.stored_truth(self.folder / "truth", index), self.labels()
+        if stored is not None and stored.category is None and labels is not None:
+            return with_classes(stored, labels)
+        if stored is not None or labels is None or self._poses is None:
+            return stored
+        return labelled_truth(self, index, labels, self._poses)
 
     def world_from_sensor(self) -> np.ndarray | None:
         """Given poses (N, 4, 4), where a file beside the scan folder holds them."""
         return self._poses
+
+
+    def labels(self) -> Labels | None:
+        """The drive's labelled boxes, where a file holds them."""
+        for name, read in (("tracklet_labels.xml", read_tracklets), ("boxes.csv", read_table)):
+            if (self.folder / name).is_file():
+                return read(self.folder / name)
+        return None
 
 
 def kitti_scan_folder(folder: Path) -> Path | None:
@@ -110,3 +128,19 @@ def _read_poses(folder: Path, files: list[Path]) -> tuple[np.ndarray | None, lis
     if len(found) == 1:
         return tables.motions_of_scans(found[0], files)
     return None, [f"{len(found)} files *poses_kitti.txt, none of them used"] if found else []
+
+
+def _navigated(folder: Path, files: list[Path]) -> tuple[np.ndarray | None, list[str]]:
+    """Poses (N, 4, 4) of the scans from the drive's navigation, None where it lacks some."""
+    calibration = folder.absolute().parent / "calib_imu_to_velo.txt"
+    packets = [folder / "oxts" / "data" / f"{file.stem}.txt" for file in files]
+    if not calibration.is_file() or not packets[0].parent.is_dir():
+        return None, []
+    missing = sum(not packet.is_file() for packet in packets)
+    if missing:
+        return None, [f"oxts/data lacks {missing} of {len(files)} packets and is ignored"]
+    named = tables.read_named(calibration)
+    if not {"R", "T"} <= named.keys():
+        return None, [f"{calibration.name} has no R and T, so oxts is ignored"]
+    lidar_from_imu = tables.motion_of_texts(calibration, named["R"], named["T"])
+    return oxts.world_from_lidar(oxts.read_packet_files(packets), lidar_from_imu), ["poses from oxts"]

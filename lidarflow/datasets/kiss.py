@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.datasets.base import DEFAULT_PERIOD_NS, check_index
+from lidarflow.datasets.base import DEFAULT_PERIOD_NS, Source, check_index
 from lidarflow.datasets.clouds import one_line
 from lidarflow.datasets.kitti_correction import correct_vertical_angle, is_wanted
 from lidarflow.errors import DataError, InstallError
@@ -24,6 +24,8 @@ class KissLoader:
 
     For recordings of several topics (mcap, rosbag) the sequence is the topic.
     """
+
+    source: Source | None = None
 
     def __init__(self, loader: str, folder: Path, sequence: str | None = None,
                  kitti_correction: str = "auto"):

@@ -58,12 +58,17 @@ def _sequence_folder(folder: Path, sequence: str | None) -> Path:
         if sequence and sequence.zfill(2) != folder_name(folder):
             raise DataError(f"{folder}: is the sequence '{folder_name(folder)}', not '{sequence}'")
         return folder
+    return choose_sequence(folder, sequences, sequence, 2)
+
+
+def choose_sequence(folder: Path, sequences: dict[str, Path], sequence: str | None, digits: int) -> Path:
+    """The folder of the wanted sequence, or of the only one; names may lack leading zeros."""
     names = ", ".join(sequences)
     if sequence is None:
         if len(sequences) > 1:
             raise DataError(f"{folder}: holds the sequences {names}; choose one with --sequence")
         return next(iter(sequences.values()))
-    chosen = sequences.get(sequence, sequences.get(sequence.zfill(2)))
+    chosen = sequences.get(sequence, sequences.get(sequence.zfill(digits)))
     if chosen is None:
         raise DataError(f"{folder}: no sequence '{sequence}'; there is {names}")
     return chosen
@@ -78,6 +83,13 @@ def _lidar_poses(sequence_folder: Path, files: list[Path]) -> tuple[np.ndarray |
     camera_from_lidar = _read_calibration(sequence_folder / "calib.txt")
     if camera_from_lidar is None:
         return None, ["calib.txt has no Tr, so the camera poses are ignored"]
+    return poses_of_camera(file, files, camera_from_lidar)
+
+
+def poses_of_camera(
+    file: Path, files: list[Path], camera_from_lidar: np.ndarray
+) -> tuple[np.ndarray | None, list[str]]:
+    """LiDAR poses (N, 4, 4) of `files` from a file of camera poses, None where they do not fit, and why."""
     world_from_camera, notes = tables.motions_of_scans(file, files)
     if world_from_camera is None:
         return None, notes
@@ -88,8 +100,5 @@ def _read_calibration(file: Path) -> np.ndarray | None:
     """camera_from_lidar (4, 4), the entry Tr; None where there is no file or no such entry."""
     if not file.is_file():
         return None
-    for line in tables.read_lines(file):
-        name, _, text = line.partition(":")
-        if name.strip() == "Tr":
-            return tables.motion_of_text(file, text)
-    return None
+    text = tables.read_named(file).get("Tr")
+    return None if text is None else tables.motion_of_text(file, text)

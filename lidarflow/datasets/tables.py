@@ -27,9 +27,30 @@ def read_numbers(path: Path, columns: int) -> np.ndarray:
     return np.array([_row(path, line, columns) for line in read_lines(path)]).reshape(-1, columns)
 
 
+def read_named(path: Path) -> dict[str, str]:
+    """What follows the first word of every line, by that word without its colon, as in calibration files."""
+    found = {}
+    for line in read_lines(path):
+        name, _, text = line.strip().partition(" ")
+        found[name.rstrip(":")] = text.strip()
+    return found
+
+
+def numbers_of_text(path: Path, text: str, count: int) -> np.ndarray:
+    """`count` finite numbers; `path` is where the text was read from."""
+    return np.array(_row(path, text, count))
+
+
 def motion_of_text(path: Path, text: str) -> np.ndarray:
     """A motion (4, 4) written as twelve numbers; `path` is where it was read from."""
     return _as_motions(path, np.array([_row(path, text, 12)]))[0]
+
+
+def motion_of_texts(path: Path, rotation: str, translation: str) -> np.ndarray:
+    """A motion (4, 4) written as nine numbers of a rotation and three of a translation."""
+    rows = np.hstack([numbers_of_text(path, rotation, 9).reshape(3, 3),
+                      numbers_of_text(path, translation, 3)[:, None]])
+    return _as_motions(path, rows.reshape(1, 12))[0]
 
 
 def read_seconds(path: Path) -> list[int]:

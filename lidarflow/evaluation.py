@@ -1,0 +1,195 @@
+"""Scores of results on disk: a run folder or a flow file, against its data set's truth or a given one."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lidarflow import io, metrics, provenance, runner
+from lidarflow.config import Config, load, updated
+from lidarflow.datasets import Dataset, Source, open_dataset
+from lidarflow.datasets.base import read_truth
+from lidarflow.datasets.clouds import natural_sorted
+from lidarflow.errors import DataError
+from lidarflow.runner import PairReport
+from lidarflow.types import FlowResult, Scan, ScanPair, Truth
+
+_UNKNOWN = float("nan")
+_SAME_POINT_M = 1e-3
+_NAMED = 3     # how many of several names a message shows
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Scores of results: one report per pair, and what they were made with.
+
+    truth_place  where the truth is, for people
+    """
+
+    reports: list[PairReport]
+    config: Config
+    truth_place: str
+
+    @property
+    def truth(self) -> str:
+        """What the pairs were scored against."""
+        return runner.truth_of(self.reports)
+
+    def metrics(self) -> dict:
+        """What metrics.json holds."""
+        return runner.metrics_of(self.reports, self.config)
+
+
+def evaluate_run(run_dir: Path, truth: Path | None = None, data: Path | None = None) -> Evaluation:
+    """Scores of all pairs of a run folder.
+
+    truth  a folder of <scan>.npz files (or one such file, for a run of one pair) to use instead of what the
+           data set has
+    data   where the run's data set is now, if not where it was
+
+    Raises DataError where a scan lacks its flow or its truth, a file belongs to another cloud, or there is no
+    truth at all.
+    """
+    source, config = provenance.read(run_dir), load(run_dir / io.CONFIG_FILE)
+    files = natural_sorted((run_dir / io.FLOW_FOLDER).glob("*.npz"))
+    if not files:
+        raise DataError(f"{run_dir}: no flow files in {io.FLOW_FOLDER}; was the run cut short? run it again")
+    dataset = _opened(source.dataset, data, needed=truth is None, run_dir=run_dir)
+    if dataset is None:
+        if len(files) != len(source.scans) - 1:
+            raise DataError(f"{run_dir}: {len(files)} flow files for {len(source.scans) - 1} pairs; "
+                            "was the run cut short? run it again")
+        reports = [_from_files(file, following, truth, len(files), config)
+                   for file, following in zip(files, [*files[1:], None], strict=True)]
+    else:
+        reports = list(_from_dataset(run_dir, files, dataset, source.scans, truth, config))
+    place = str(truth) if truth is not None else str(dataset.source.folder)
+    _check_truths(place, reports)
+    return Evaluation(reports, config, place)
+
+
+def evaluate_file(file: Path, truth: Path | None) -> Evaluation:
+    """Scores of one flow file against a truth file (or a folder with one of the same name).
+
+    Raises DataError for files that cannot be read, of different length, or without truth.
+    """
+    config = updated(Config(), io.load_flow(file).config, str(file))
+    if truth is None:
+        raise DataError(f"{file}: a flow file alone has no truth; give --truth FILE.npz, "
+                        "or evaluate the folder of its run")
+    return Evaluation([_from_files(file, None, truth, 1, config)], config, str(truth))
+
+
+def _opened(source: Source | None, data: Path | None, needed: bool, run_dir: Path) -> Dataset | None:
+    """The data set of a run; None where it is not at hand and not needed either."""
+    if data is not None:
+        kept = source if source is not None else Source(data, None, None, "auto")
+        return open_dataset(data, kept.loader, kept.sequence, kept.kitti_correction)
+    if source is not None and source.folder.exists():
+        return open_dataset(source.folder, source.loader, source.sequence, source.kitti_correction)
+    if not needed:
+        return None
+    if source is None:
+        raise DataError(f"{run_dir}: was not made from a data folder; give --truth FOLDER")
+    raise DataError(f"{source.folder}: no such folder any more, and {run_dir} was made from it; "
+                    "give --data with its new place, or --truth")
+
+
+def _from_dataset(
+    run_dir: Path, files: list[Path], dataset: Dataset, scans: tuple[int, ...], truth: Path | None,
+    config: Config,
+) -> Iterator[PairReport]:
+    """A report for every pair that the run went through, scans read once each."""
+    if max(scans) >= len(dataset):
+        raise DataError(f"{dataset.name}: {len(dataset)} scans, but {run_dir} goes up to scan {max(scans)}; "
+                        "is this the data of the run?")
+    left = {file.stem: file for file in files}
+    target = dataset.scan(scans[0])
+    for index, following in itertools.pairwise(scans):
+        source, target = target, dataset.scan(following)
+        file = left.pop(source.name, None)
+        if file is None:
+            raise DataError(f"{run_dir}: no flow of scan {source.name} ({len(files)} flow files for "
+                            f"{len(scans) - 1} pairs); was the run cut short? run it again")
+        points, result = _read(file)
+        _check_points(file, points, source, dataset)
+        if truth is None:
+            known, origin = runner.find_truth(dataset, index, ScanPair(source, target))
+        else:
+            known = _given_truth(truth, source.name, len(source), len(scans) - 1)
+            origin = known.origin
+        alignment = metrics.alignment(source, target, result, config.crispness.sigma_m)
+        yield runner.report_result(source, result, None, alignment, known, origin)
+    if left:
+        raise DataError(f"{run_dir}: flow of {_some(sorted(left))}, which is no scan of {dataset.name} "
+                        "that the run went through; is this the data of the run?")
+
+
+def _from_files(
+    file: Path, following: Path | None, truth: Path, pairs: int, config: Config
+) -> PairReport:
+    """A report without the data set: the target is the next flow file's cloud, where there is one."""
+    points, result = _read(file)
+    source = Scan(points, name=file.stem)
+    known = _given_truth(truth, source.name, len(source), pairs)
+    alignment = metrics.Alignment(_UNKNOWN, _UNKNOWN, _UNKNOWN, config.crispness.sigma_m)
+    if following is not None:
+        target = Scan(io.load_flow(following).points, name=following.stem)
+        alignment = metrics.alignment(source, target, result, config.crispness.sigma_m)
+    return runner.report_result(source, result, None, alignment, known, known.origin)
+
+
+def _read(file: Path) -> tuple[np.ndarray, FlowResult]:
+    """The source cloud's points (N, 3) and the answer in a flow file."""
+    found = io.load_flow(file)
+    try:
+        return found.points, found.result()
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{file}: damaged flow file ({error})") from None
+
+
+def _given_truth(place: Path, name: str, rows: int, pairs: int) -> Truth:
+    """Truth of the scan called `name`, with `rows` points: `place` itself, or a file of that name in it."""
+    if place.is_dir():
+        file = place / f"{name}.npz"
+        if not file.is_file():
+            found = len(list(place.glob("*.npz")))
+            raise DataError(f"{place}: no {file.name}, the truth of scan {name} ({found} other .npz files); "
+                            "expected one for every scan with a flow")
+        return read_truth(file, rows, name)
+    if not place.is_file():
+        raise DataError(f"{place}: no such file or folder; expected the truth of {name}")
+    if pairs > 1:
+        raise DataError(f"{place}: the truth of one scan for {pairs} pairs; "
+                        "give a folder with <scan>.npz for each")
+    return read_truth(place, rows, name)
+
+
+def _check_points(file: Path, points: np.ndarray, scan: Scan, dataset: Dataset) -> None:
+    """Raise DataError unless a flow file's points (N, 3) are those of the scan."""
+    if len(points) != len(scan):
+        raise DataError(f"{file}: {len(points)} points, but scan {scan.name} of {dataset.name} has "
+                        f"{len(scan)}; is this the data of the run?")
+    apart_m = np.linalg.norm(points - scan.points, axis=1)
+    if np.nanmax(apart_m, initial=0.0) > _SAME_POINT_M:
+        raise DataError(f"{file}: its points are not those of scan {scan.name} of {dataset.name}, "
+                        f"up to {np.nanmax(apart_m):.3g} m apart; is this the data of the run?")
+
+
+def _check_truths(place: str, reports: list[PairReport]) -> None:
+    """Raise DataError where there is no truth, or only some pairs have one of their own."""
+    without = [report.frame for report in reports if report.scores is None]
+    if len(without) == len(reports):
+        raise DataError(f"{place}: no truth (neither flow, nor boxes and poses, nor poses); give --truth")
+    poorer = without or [report.frame for report in reports if report.truth == metrics.POSES_ONLY]
+    if 0 < len(poorer) < len(reports):
+        raise DataError(f"{place}: no truth of {_some(poorer)}, but of the other scans; "
+                        "get the missing truth, or run without these scans")
+
+
+def _some(names: list[str]) -> str:
+    """The first names, and how many there are."""
+    shown = ", ".join(names[:_NAMED])
+    return shown if len(names) <= _NAMED else f"{shown}, … ({len(names)} in all)"

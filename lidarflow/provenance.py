@@ -1,0 +1,48 @@
+"""What a run was made of: kept in its folder, so that its data set can be opened again."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from lidarflow import io
+from lidarflow.datasets import Source
+from lidarflow.errors import DataError
+
+
+@dataclass(frozen=True, slots=True)
+class RunSource:
+    """A data set, None where `open_dataset` did not open it, and the indices of the scans gone through."""
+
+    dataset: Source | None
+    scans: tuple[int, ...]
+
+
+def write(run_dir: Path, source: RunSource) -> None:
+    """Write source.json into a run folder."""
+    opened = source.dataset
+    described = {} if opened is None else {
+        "data": str(opened.folder), "loader": opened.loader, "sequence": opened.sequence,
+        "kitti_correction": opened.kitti_correction}
+    io.write_json(run_dir / io.SOURCE_FILE, {**described, "scans": source.scans})
+
+
+def read(run_dir: Path) -> RunSource:
+    """What source.json in a run folder says; DataError where there is none, or it is damaged."""
+    file = run_dir / io.SOURCE_FILE
+    try:
+        values = json.loads(file.read_text(encoding="utf-8"))
+        scans = tuple(int(index) for index in values["scans"])
+        if len(scans) < 2 or min(scans) < 0:
+            raise ValueError("scans must be two indices or more")
+        if "data" not in values:
+            return RunSource(None, scans)
+        texts = values["data"], values["loader"], values["kitti_correction"]
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError("data, loader and kitti_correction must be texts")
+        return RunSource(Source(Path(values["data"]), values["loader"], values["sequence"],
+                                values["kitti_correction"]), scans)
+    except FileNotFoundError:
+        raise DataError(f"{run_dir}: no {io.SOURCE_FILE}, which says what a run was made of; "
+                        "expected a folder that 'lidarflow run' wrote") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{file}: damaged ({type(error).__name__}: {error}); run again") from None
