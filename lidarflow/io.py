@@ -78,7 +78,8 @@ class FlowFile:
         """The answer that the file holds, to 32-bit accuracy; without matches, boxes of objects and times."""
         return FlowResult(
             self.flow.astype(np.float64), self.motions, self.valid, self.in_graph, self.is_dynamic,
-            self.ego_motion, SolveStats(**self.stats), is_ground=self.is_ground, object_id=self.object_id)
+            self.ego_motion, SolveStats(**self.stats), is_ground=self.is_ground, object_id=self.object_id,
+            std_m=self.std_m.astype(np.float64))
 
 
 @contextlib.contextmanager

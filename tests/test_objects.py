@@ -1,5 +1,7 @@
 """Moving objects: the evidence for them, their fit, and what is found in generated scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -204,6 +206,30 @@ def test_a_wall_is_not_believed_to_slide_along_itself():
     rows = np.flatnonzero(view.points[:, 0] > 12.0)
     sliding = Body(rows, pose.from_translation([0.0, 0.5, 0.0]))
     assert not acceptance.moves(view, sliding, 0.1, CONFIG)
+
+
+def test_leaves_that_hang_are_no_body():
+    view = scene(np.array([0.6, 0.0, 0.0]), 16)
+    rows = np.flatnonzero(view.points[:, 0] < 12.0)
+    shift = pose.from_translation([0.6, 0.0, 0.0])
+    assert acceptance.moves(view, Body(rows, shift), 0.1, CONFIG)
+    assert not acceptance.moves(view, Body(rows, shift), 0.1, replace(CONFIG, max_clearance_m=0.01))
+
+
+def test_what_the_surroundings_do_too_is_not_a_body():
+    shift = np.array([0.0, 0.12, 0.0])
+    random = rng(17)
+    box = box_surface(6000, 18) * [3.0, 0.3, 2.0] + [12.0, 0.0, 0.0]
+    source = box + random.normal(0, 0.004, box.shape)
+    target = box_surface(6000, 19) * [3.0, 0.3, 2.0] + [12.0, 0.0, 0.0] + shift
+    matched = np.arange(0, len(source), 10)
+    view = view_of_pair.look(
+        source, target, np.zeros(len(target), bool), source, np.zeros(len(source), bool),
+        (matched, source[matched] + shift), 0.4, CONFIG)
+    part = np.flatnonzero(np.abs(view.points[:, 0] - 12.0) < 0.8)
+    body = Body(part, pose.from_translation(shift))
+    assert acceptance._surroundings_gain(view, body, view.points[part], shift)
+    assert not acceptance.moves(view, body, 0.1, CONFIG)
 
 
 def test_a_body_is_completed_by_what_it_surrounds_and_what_follows_it():

@@ -7,7 +7,7 @@ from lidarflow.config import ObjectsConfig
 from lidarflow.lidar.body import Body
 from lidarflow.lidar.clusters import near_rows
 from lidarflow.lidar.evidence import tolerance
-from lidarflow.lidar.surface import CAP_M, misfit
+from lidarflow.lidar.surface import CAP_M, misfit, nearest
 from lidarflow.lidar.view import View
 
 _GROUND_RADIUS_M = 10.0
@@ -15,6 +15,8 @@ _MIN_GROUND_POINTS = 20
 _OWN_M = 0.7             # what is nearer to a body may be a part of it
 _SURROUNDINGS_M = 3.0
 _MIN_SURROUNDINGS = 100
+_CLEARLY_OFF = 1.5       # tolerances; at one, every other point is still explained by chance
+_GAIN_M = 0.01           # less is noise
 _AROUND_M = 0.25   # target points this near to a moved body should be the body's
 
 
@@ -32,19 +34,21 @@ def moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
     return (
         _clearance(view, points) <= config.max_clearance_m
         and _shape_ratio(view, body, moved) <= config.max_shape_ratio
-        and not _surroundings_gain(view, body, points)
-        and _observability(view, body, shift / np.linalg.norm(shift)) >= config.min_observability
+        and not _surroundings_gain(view, body, points, shift)
+        and _observability(view, body, shift) >= config.min_observability
         and _matches_agree(view, body, shift, config)
-        and _left_and_arrived(view, body, moved, shift, config))
+        and min(_left_and_arrived(view, body, moved)) >= config.min_unexplained * _should_show(
+            view, body, moved, shift, config))
 
 
 def _clearance(view: View, points: np.ndarray) -> float:
-    """Height of the lowest point over the ground around it; 0 where none is seen."""
+    """Height in metres of the lowest point over the ground around it; 0 where no ground is seen."""
     lowest = points[np.argmin(points[:, 2])]
-    near = view.ground.query_ball_point(lowest, _GROUND_RADIUS_M) if view.ground.n else []
-    if len(near) < _MIN_GROUND_POINTS:
+    ground = np.asarray(view.ground.data)
+    near = np.hypot(ground[:, 0] - lowest[0], ground[:, 1] - lowest[1]) <= _GROUND_RADIUS_M
+    if near.sum() < _MIN_GROUND_POINTS:
         return 0.0
-    return float(lowest[2] - np.median(view.ground.data[near][:, 2]))
+    return float(lowest[2] - np.median(ground[near, 2]))
 
 
 def _shape_ratio(view: View, body: Body, moved: np.ndarray) -> float:
@@ -66,24 +70,26 @@ def _shape_ratio(view: View, body: Body, moved: np.ndarray) -> float:
     return float(own_sq / ego_sq) if ego_sq > 0 else np.inf
 
 
-def _surroundings_gain(view: View, body: Body, points: np.ndarray) -> bool:
-    """Whether the same motion explains what surrounds the body better too: then the ego-motion is off."""
+def _surroundings_gain(view: View, body: Body, points: np.ndarray, shift: np.ndarray) -> bool:
+    """Whether the same motion explains more of what surrounds the body too: then the ego-motion is off."""
+    if np.linalg.norm(shift) > CAP_M:
+        return False   # no ego-motion is that far off
     around = np.setdiff1d(
         near_rows(view.points, points, _SURROUNDINGS_M), near_rows(view.points, points, _OWN_M))
     if len(around) < _MIN_SURROUNDINGS:
         return False
-    own_sq = (view.after(around, body.over_ground).plane_m ** 2).sum()
-    return bool(own_sq < (view.by_ego.plane_m[around] ** 2).sum())
+    gain_m = view.by_ego.plane_m[around] - view.after(around, body.over_ground).plane_m
+    return int((gain_m > _GAIN_M).sum()) > int((gain_m < -_GAIN_M).sum())
 
 
-def _observability(view: View, body: Body, direction: np.ndarray) -> float:
-    """Mean squared cosine between the body's normals and the direction (3,) it moves in.
+def _observability(view: View, body: Body, shift: np.ndarray) -> float:
+    """Mean squared cosine between the body's normals and the way it moves, `shift` (3,).
 
     A wall explains any motion along itself, so that none is to be believed (the aperture problem).
     """
     normals = view.source.normals[body.rows]
     normals = normals[np.isfinite(normals).all(axis=1)]
-    return float(((normals @ direction) ** 2).mean()) if len(normals) else 0.0
+    return float(((normals @ (shift / np.linalg.norm(shift))) ** 2).mean()) if len(normals) else 0.0
 
 
 def _matches_agree(view: View, body: Body, shift: np.ndarray, config: ObjectsConfig) -> bool:
@@ -96,19 +102,21 @@ def _matches_agree(view: View, body: Body, shift: np.ndarray, config: ObjectsCon
     return np.hypot(off[0], off[1]) <= min(config.max_match_deviation * np.hypot(shift[0], shift[1]), CAP_M)
 
 
-def _left_and_arrived(
-    view: View, body: Body, moved: np.ndarray, shift: np.ndarray, config: ObjectsConfig
-) -> bool:
-    """Whether the body left where it was and arrived where the source, as it stood, had nothing.
+def _left_and_arrived(view: View, body: Body, moved: np.ndarray) -> tuple[float, float]:
+    """Share of the body that left where it was, and share that arrived where the source had nothing.
 
-    What a newcomer hides seems to have left, but has arrived nowhere new. Only surfaces that the motion
-    shifts by more than explained points may be off can show either.
+    What a newcomer hides seems to have left, but has arrived nowhere new.
     """
+    left = float(view.evidence.unexplained[body.rows].mean())
+    off_m, row = nearest(view.upright_tree, moved, CAP_M)
+    found = np.isfinite(off_m)
+    return left, float(view.has_appeared[row[found]].mean()) if found.any() else 0.0
+
+
+def _should_show(
+    view: View, body: Body, moved: np.ndarray, shift: np.ndarray, config: ObjectsConfig
+) -> float:
+    """Share of the body whose surface the motion shifts by clearly more than explained points may be off."""
     normals = view.source.normals[body.rows]
     away_m = np.abs(np.where(np.isfinite(normals), normals, 0.0) @ shift)
-    expected = float((away_m > tolerance(np.linalg.norm(moved, axis=1), config)).mean())
-    left = float(view.evidence.unexplained[body.rows].mean())
-    off_m, nearest = view.upright_tree.query(moved, distance_upper_bound=CAP_M)
-    found = np.isfinite(off_m)
-    arrived = float(view.has_appeared[nearest[found]].mean()) if found.any() else 0.0
-    return min(left, arrived) >= config.min_unexplained * expected
+    return float((away_m > _CLEARLY_OFF * tolerance(np.linalg.norm(moved, axis=1), config)).mean())
