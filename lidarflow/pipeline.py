@@ -43,7 +43,9 @@ class Stopwatch:
 
 def estimate_flow(pair: ScanPair, config: Config | None = None) -> FlowResult:
     """Dense rigid flow from one scan to the next; raises DataError for scans that cannot be used."""
-    return _estimate(pair, config or Config(), previous=None, ego_guess=None).result
+    config = config or Config()
+    result, _ = explain(prepare(pair, config), config, Tracks())
+    return result
 
 
 class FlowEstimator:
@@ -68,8 +70,10 @@ class FlowEstimator:
             return None
         # Forgotten first: after a scan that cannot be used, the next pair must not inherit an older one's.
         previous, self._previous = self._previous, None
-        self._previous = _estimate(ScanPair(source, scan), self.config, previous, guess)
-        return self._previous.result
+        prepared = prepare(ScanPair(source, scan), self.config, previous, guess)
+        result, tracks = explain(prepared, self.config, previous.tracks if previous else Tracks())
+        self._previous = Previous(source.points, result, prepared.target, tracks)
+        return result
 
 
 def run(dataset: Dataset, frames: list[int], config: Config) -> Iterator[tuple[ScanPair, FlowResult]]:
@@ -84,10 +88,26 @@ def run(dataset: Dataset, frames: list[int], config: Config) -> Iterator[tuple[S
         source = scan
 
 
-def _estimate(
-    pair: ScanPair, config: Config, previous: Previous | None, ego_guess: np.ndarray | None
-) -> Previous:
-    """The result of a pair and what the next one takes over."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """A pair up to the question what moves: features, ego-motion, mesh, and the graph with its matches."""
+
+    pair: ScanPair
+    source: features.Features
+    target: features.Features
+    ego_motion: np.ndarray
+    mesh: mesh.Mesh
+    graph: frontend.Graph
+    seconds: dict[str, float]
+
+
+def prepare(
+    pair: ScanPair, config: Config, previous: Previous | None = None, ego_guess: np.ndarray | None = None
+) -> Prepared:
+    """All of a pair that comes before objects and solver; raises DataError for scans that cannot be used.
+
+    `previous` is what the pair before left, `ego_guess` a start value (4, 4) for its ego-motion.
+    """
     for scan in (pair.source, pair.target):
         _require_points(scan, config)
     timed = Stopwatch()
@@ -103,13 +123,20 @@ def _estimate(
     with timed("matching"):
         start_motions = _start(points, previous, ego_motion, config)
         graph = frontend.build_problem(pair, source, target, surface_mesh, start_motions, config)
-        matches = graph.problem.points[graph.problem.match_index], graph.problem.match_target
+    return Prepared(pair, source, target, ego_motion, surface_mesh, graph, timed.seconds)
+
+
+def explain(prepared: Prepared, config: Config, tracks: Tracks) -> tuple[FlowResult, Tracks]:
+    """The result of a prepared pair, and the tracks of its objects that continue `tracks`."""
+    pair, source, graph, ego_motion = prepared.pair, prepared.source, prepared.graph, prepared.ego_motion
+    timed = Stopwatch(dict(prepared.seconds))
+    points = pair.source.points
+    matches = graph.problem.points[graph.problem.match_index], graph.problem.match_target
     with timed("objects"):
         found = Attribution.none(len(points))
         if config.objects.enabled:
             matched = graph.rows[graph.problem.match_index], graph.problem.match_target
-            tracks = previous.tracks if previous else Tracks()
-            found = attribute(pair, source, target, matched, ego_motion, tracks, config)
+            found = attribute(pair, source, prepared.target, matched, ego_motion, tracks, config)
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
     with timed("solver"):
         motions, solved, stats = gtsam_lm.solve(graph.problem, config.solver, config.graph.min_matches)
@@ -126,15 +153,16 @@ def _estimate(
         if not config.objects.enabled:
             residual_flow = flow - (pose.apply(ego_motion, points) - points)
             is_dynamic = dynamic.detect(
-                points, residual_flow, is_solved, surface_mesh.edges, ego_motion,
-                pair.target.points[target.usable], pair.dt_s, config.dynamic)
-    valid = source.ground | found.explained | is_solved
-    object_id = np.full(len(points), -1, np.int32)
-    object_id[on_object] = found.ids[found.owner[on_object]]
+                points, residual_flow, is_solved, prepared.mesh.edges, ego_motion,
+                pair.target.points[prepared.target.usable], pair.dt_s, config.dynamic)
+        valid = source.ground | found.explained | is_solved
+        object_id = np.full(len(points), -1, np.int32)
+        object_id[on_object] = found.ids[found.owner[on_object]]
+        std_m = _std(points, found, graph, motions, solved, valid, flow, config)
     result = FlowResult(
         flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,
-        object_id, found.objects, _std(points, found, graph, motions, solved, valid, flow, config))
-    return Previous(points, result, target, found.tracks)
+        object_id, found.objects, std_m)
+    return result, found.tracks
 
 
 def _std(

@@ -3,13 +3,15 @@
     python scripts/ablation.py FOLDER… [--static FOLDER…] [--sensitivity] [--n-scans 3] [--json OUT.json]
 
 FOLDERs have true flow; in those after --static nothing moves. Without --sensitivity, one part is left out a
-row; with it, every setting of the search is halved and doubled in turn. Rows are means over all pairs.
+row; with it, every setting of the search is halved and doubled in turn. Rows are means over all pairs, each
+pair by itself: what comes before the search is done once.
 """
 
 import argparse
 import json
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,9 @@ from evaluate import table
 
 from lidarflow import config as settings
 from lidarflow import pipeline, runner
-from lidarflow.datasets import open_dataset
+from lidarflow.datasets import Dataset, open_dataset
+from lidarflow.lidar.tracking import Tracks
+from lidarflow.types import ScanPair
 
 LEFT_OUT = {
     "all parts (default)": (),
@@ -39,22 +43,41 @@ COLUMNS = {
 }
 
 
-def scores(folders: list[Path], static: list[Path], n_scans: int | None, config: settings.Config) -> dict:
-    """Means of COLUMNS over the pairs of `folders`, and how many objects a pair of `static` has."""
-    with_truth = [figures for folder in folders for figures in _pairs(folder, n_scans, config)]
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """A pair whose features, ego-motion, mesh and matches are done, and where it comes from."""
+
+    dataset: Dataset
+    index: int
+    prepared: pipeline.Prepared
+
+
+def cases(folders: list[Path], n_scans: int | None) -> list[Case]:
+    """Every pair of the folders."""
+    found, config = [], settings.Config()
+    for folder in folders:
+        dataset = open_dataset(folder, kitti_correction=config.preparation.kitti_correction)
+        scans = [dataset.scan(frame) for frame in runner.choose_frames(dataset, 0, n_scans)]
+        for index, pair in enumerate(pairwise(scans)):
+            found.append(Case(dataset, index, pipeline.prepare(ScanPair(*pair), config)))
+    return found
+
+
+def scores(with_truth: list[Case], static: list[Case], config: settings.Config) -> dict:
+    """Means of COLUMNS over the pairs with truth, and how many objects a static pair has."""
+    figures = [_figures(case, config) for case in with_truth]
     found = {}
     for name in COLUMNS:
-        values = [figures[name] for figures in with_truth if np.isfinite(figures.get(name, np.nan))]
+        values = [row[name] for row in figures if np.isfinite(row.get(name, np.nan))]
         found[name] = float(np.mean(values)) if values else float("nan")
-    objects = [figures["objects"] for folder in static for figures in _pairs(folder, n_scans, config)]
+    objects = [_figures(case, config)["objects"] for case in static]
     return found | {"objects_in_static": float(np.mean(objects)) if objects else float("nan")}
 
 
-def _pairs(folder: Path, n_scans: int | None, config: settings.Config) -> Iterator[dict[str, float]]:
-    dataset = open_dataset(folder, kitti_correction=config.preparation.kitti_correction)
-    frames = runner.choose_frames(dataset, 0, n_scans)
-    for index, (pair, result) in zip(frames, pipeline.run(dataset, frames, config), strict=False):
-        yield runner.figures_of(runner.report_pair(dataset, index, pair, result, config))
+def _figures(case: Case, config: settings.Config) -> dict[str, float]:
+    result, _ = pipeline.explain(case.prepared, config, Tracks())
+    return runner.figures_of(
+        runner.report_pair(case.dataset, case.index, case.prepared.pair, result, config))
 
 
 def halved_and_doubled() -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -82,10 +105,11 @@ def main() -> None:
     parser.add_argument("--n-scans", type=int)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
+    with_truth, static = cases(options.folders, options.n_scans), cases(options.static, options.n_scans)
     rows, kept = [], {}
     for title, overrides in halved_and_doubled() if options.sensitivity else LEFT_OUT.items():
         config = settings.load(options.paper) if overrides is None else settings.load(overrides=overrides)
-        found = scores(options.folders, options.static, options.n_scans, config)
+        found = scores(with_truth, static, config)
         kept[title] = found
         values = [f"{100 * found[c]:.2f} %" if c in ("movers_found", "false_movers") else f"{found[c]:.4f}"
                   for c in COLUMNS]
