@@ -72,7 +72,8 @@ def process(
     # The first pair is done before the folder is touched: a bad data set leaves no empty run behind.
     io.check_run_folder(out)
     reports: list[PairReport] = []
-    results = _explained(pipeline.run(dataset, frames, config), dataset, frames, reports, out)
+    estimator = pipeline.FlowEstimator(config)
+    results = _explained(pipeline.run(dataset, frames, estimator), dataset, frames, reports, out)
     first = next(results)
     io.new_run_folder(out)
     io.write_toml(out / io.CONFIG_FILE, config)

@@ -6,10 +6,10 @@ from scipy.spatial import cKDTree
 from shared_data import SHARED, needs_shared
 
 from lidarflow import pose, synthetic
-from lidarflow.config import Config, ObjectsConfig
+from lidarflow.config import ObjectsConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.lidar import clusters, evidence, frontend, objects, rigid_fit
-from lidarflow.pipeline import estimate_flow, run
+from lidarflow.pipeline import FlowEstimator, estimate_flow, run
 from lidarflow.types import FlowProblem, ScanPair
 
 CONFIG = ObjectsConfig()
@@ -132,7 +132,7 @@ def test_nothing_moves_in_a_static_yard():
 @pytest.mark.parametrize("name", ["kitti_tracked_0005_from_000", "kitti_tracked_0005_from_040"])
 def test_tracked_kitti_drives(name):
     dataset = open_dataset(SHARED / name)
-    for index, (_, result) in enumerate(run(dataset, [0, 1, 2], Config())):
+    for index, (_, result) in enumerate(run(dataset, [0, 1, 2], FlowEstimator())):
         truth = dataset.truth(index)
         error_m = np.linalg.norm(result.flow - truth.flow, axis=1)
         moving, still = truth.is_dynamic & truth.valid, ~truth.is_dynamic & truth.valid
@@ -147,5 +147,5 @@ def test_tracked_kitti_drives(name):
     "name", ["kitti_odometry_00_pair_094", "kitti_odometry_00_pair_198", "ouster_os1_128"])
 def test_nothing_moves_in_static_folders(name):
     dataset = open_dataset(SHARED / name)
-    (_, result), = run(dataset, [0, 1], Config())
+    (_, result), = run(dataset, [0, 1], FlowEstimator())
     assert result.objects == ()
