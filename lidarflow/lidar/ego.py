@@ -35,12 +35,14 @@ def find(source: np.ndarray, target: np.ndarray, guess: np.ndarray | None, confi
 
 
 def register(
-    source: np.ndarray, target: np.ndarray, start: np.ndarray | None, config: EgoConfig
+    source: np.ndarray, target: np.ndarray, start: np.ndarray | None, config: EgoConfig,
+    start_off_m: float = np.inf,
 ) -> np.ndarray:
     """target_from_source (4, 4) of two clouds (N, 3) and (M, 3) in metres, by robust point-to-plane ICP.
 
-    `start` is a first guess; without one the search begins wide, at the identity. Raises DataError when the
-    clouds have too little in common.
+    `start` is a first guess; without one the search begins wide, at the identity. A guess known to be less
+    than `start_off_m` off is not searched for wider than that. Raises DataError when the clouds have too
+    little in common.
     """
     voxel_m = voxel_for(source, config.voxel_m)
     fine = thinned(source, voxel_m), with_normals(thinned(target, voxel_m), voxel_m)
@@ -49,8 +51,9 @@ def register(
         coarse_m = _COARSE_VOXELS * voxel_m
         coarse = thinned(source, coarse_m), with_normals(thinned(target, coarse_m), coarse_m)
         target_from_source = robust_point_to_plane(*coarse, _STAGES_VOXELS[0] * voxel_m, np.eye(4))
-    for reach_voxels in _STAGES_VOXELS[1:]:
-        target_from_source = robust_point_to_plane(*fine, reach_voxels * voxel_m, target_from_source)
+    reaches_m = [reach_voxels * voxel_m for reach_voxels in _STAGES_VOXELS[1:]]
+    for reach_m in [reach_m for reach_m in reaches_m if reach_m <= start_off_m] or reaches_m[-1:]:
+        target_from_source = robust_point_to_plane(*fine, reach_m, target_from_source)
     _require_overlap(*fine, _STAGES_VOXELS[2] * voxel_m, target_from_source)
     return target_from_source
 
