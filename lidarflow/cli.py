@@ -3,6 +3,7 @@
 Heavy packages are imported inside the commands, so that --help answers at once.
 """
 
+import contextlib
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,7 +16,7 @@ from lidarflow.errors import LidarflowError
 if TYPE_CHECKING:
     from lidarflow.config import Config
     from lidarflow.datasets import Dataset
-    from lidarflow.runner import PairReport, Viewing
+    from lidarflow.runner import Viewing
 
 _INTERRUPTED = 130     # what typer makes of Ctrl-C
 
@@ -29,6 +30,14 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, e.g. mesh.max_edge_m=0.5.")]
 Out = Annotated[Path, typer.Option("--out", help="Where the results go.")]
+Data = Annotated[Path, typer.Argument(help="A folder of scans, a KITTI folder, or what KISS-ICP reads.")]
+Loader = Annotated[str | None, typer.Option("--dataloader", help="Loader; guessed when not given.")]
+Sequence = Annotated[
+    str | None, typer.Option("--sequence", "-s", help="Sequence, where there are several.")]
+Count = Annotated[int | None, typer.Option("--n-scans", "-n", help="How many scans; all if not given.")]
+Jump = Annotated[int, typer.Option("--jump", "-j", help="First scan to process.")]
+MethodName = Annotated[
+    str, typer.Option("--method", help="ours, or a baseline: zero, ego, icp, ransac_icp.")]
 Visualize = Annotated[bool, typer.Option("--visualize", help="Open the viewer, show results as they come.")]
 Arrows = Annotated[bool, typer.Option("--arrows", help="Also record the total flow as arrows.")]
 
@@ -72,17 +81,18 @@ def pair(
     out: Annotated[Path, typer.Option("--out", help="The flow file (.npz) to write.")],
     recording: Annotated[Path | None, typer.Option(help="Also write a recording (.rrd).")] = None,
     picture: Annotated[Path | None, typer.Option(help="Also write a bird's-eye picture (.png).")] = None,
+    method: MethodName = "ours",
     visualize: Visualize = False,
     arrows: Arrows = False,
     config: ConfigFile = None,
     overrides: Overrides = None,
 ) -> None:
     """Flow between two clouds; nothing else is needed."""
-    from lidarflow import datasets, io, metrics, pipeline, preview
+    from lidarflow import datasets, io, methods, metrics, preview
     from lidarflow.config import load
     from lidarflow.types import ScanPair
 
-    settings = load(config, tuple(overrides or ()))
+    settings, chosen = load(config, tuple(overrides or ())), methods.find(method)
     for option, file, suffix in (("--out", out, ".npz"), ("--recording", recording, ".rrd"),
                                  ("--picture", picture, ".png")):
         if file is not None:
@@ -91,7 +101,7 @@ def pair(
     correction = settings.preparation.kitti_correction
     scans = ScanPair(datasets.read_scan(source, correction), datasets.read_scan(target, correction))
     with _working(f"flow from {source.name} to {target.name}"):
-        result = pipeline.estimate_flow(scans, settings)
+        result = chosen.estimate(scans, settings)
         alignment = metrics.alignment(scans.source, scans.target, result, settings.crispness.sigma_m)
         if picture is not None:
             with io.written_aside(picture) as aside:
@@ -102,20 +112,20 @@ def pair(
     from lidarflow.tables import pair_table
 
     _print(pair_table(scans, result, alignment))
+    print(f"method     {method}")
     print(f"flow       {out}")
     print(f"look at it with: lidarflow view {out} --target {target}")
 
 
 @app.command()
 def run(
-    data: Annotated[Path, typer.Argument(help="A folder of scans, a KITTI folder, or what KISS-ICP reads.")],
+    data: Data,
     out: Out,
-    dataloader: Annotated[str | None, typer.Option(help="Loader; guessed when not given.")] = None,
-    sequence: Annotated[
-        str | None, typer.Option("--sequence", "-s", help="Sequence, where there are several.")] = None,
-    n_scans: Annotated[
-        int | None, typer.Option("--n-scans", "-n", help="How many scans; all if not given.")] = None,
-    jump: Annotated[int, typer.Option("--jump", "-j", help="First scan to process.")] = 0,
+    dataloader: Loader = None,
+    sequence: Sequence = None,
+    n_scans: Count = None,
+    jump: Jump = 0,
+    method: MethodName = "ours",
     visualize: Visualize = False,
     arrows: Arrows = False,
     record: Annotated[bool, typer.Option(help="Write recording.rrd (about 5 MB a pair).")] = True,
@@ -123,18 +133,51 @@ def run(
     overrides: Overrides = None,
 ) -> None:
     """Flow between all consecutive scans of a data set."""
+    from lidarflow import methods
     from lidarflow.config import load
-    from lidarflow.datasets import open_dataset
     from lidarflow.runner import Viewing
 
     settings = load(config, tuple(overrides or ()))
-    dataset = open_dataset(data, dataloader, sequence, settings.preparation.kitti_correction)
-    guessed = "" if dataloader else " (guessed from what lies there; --dataloader overrides)"
-    print(f"reading    {data}: {len(dataset)} scans")
-    print(f"loader     {dataset.loader}{guessed}")
-    if dataset.note:
-        print(f"note       {dataset.note}")
-    _process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans)
+    methods.find(method)
+    dataset = _open(data, dataloader, sequence, settings)
+    print(f"method     {method}")
+    _process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans, method)
+
+
+@app.command()
+def compare(
+    data: Data,
+    names: Annotated[
+        str, typer.Option("--methods", help="What to compare: ours, zero, ego, icp, ransac_icp.")
+    ] = "ours,ego,icp,ransac_icp",
+    dataloader: Loader = None,
+    sequence: Sequence = None,
+    n_scans: Count = None,
+    jump: Jump = 0,
+    out: Annotated[Path | None, typer.Option("--out", help="Also write all figures (.json).")] = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run several methods on the same scans, one table."""
+    from lidarflow import compare as comparing
+    from lidarflow import io, runner, tables
+    from lidarflow.config import load
+
+    settings, chosen = load(config, tuple(overrides or ())), comparing.names_of(names)
+    if out is not None:
+        io.check_output("--out", out, ".json", inputs=(data,))
+    dataset = _open(data, dataloader, sequence, settings)
+    frames = runner.choose_frames(dataset, jump, n_scans)
+    with _progress(len(frames) - 1) as on_pair:
+        found = comparing.compare(dataset, frames, chosen, settings, on_pair)
+    print()
+    _print(tables.compare_table(found))
+    print()
+    for note in tables.compare_notes(found):
+        print(note)
+    if out is not None:
+        io.write_json(out, found.to_dict())
+        print(f"figures    {out}")
 
 
 @app.command(name="eval")
@@ -232,26 +275,44 @@ def show_config() -> None:
     _print(config_table())
 
 
-def _process(
-    dataset: "Dataset", settings: "Config", out: Path, viewing: "Viewing", jump: int, n_scans: int | None
-) -> None:
+def _open(data: Path, dataloader: str | None, sequence: str | None, settings: "Config") -> "Dataset":
+    """The data set, and a word on what it was taken for."""
+    from lidarflow.datasets import open_dataset
+
+    dataset = open_dataset(data, dataloader, sequence, settings.preparation.kitti_correction)
+    guessed = "" if dataloader else " (guessed from what lies there; --dataloader overrides)"
+    print(f"reading    {data}: {len(dataset)} scans")
+    print(f"loader     {dataset.loader}{guessed}")
+    if dataset.note:
+        print(f"note       {dataset.note}")
+    return dataset
+
+
+@contextlib.contextmanager
+def _progress(pairs: int):
+    """A bar on standard error; yields what to call with the name of every finished pair."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
+               TimeElapsedColumn())
+    console = _console(sys.stderr)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("scan pairs", total=pairs)
+        yield lambda frame: progress.update(task, advance=1, description=f"scan pairs, {frame} done")
+
+
+def _process(
+    dataset: "Dataset", settings: "Config", out: Path, viewing: "Viewing", jump: int, n_scans: int | None,
+    method: str = "ours",
+) -> None:
     from lidarflow import runner
     from lidarflow.tables import run_notes, run_table
 
     _check_live_view(viewing.visualize)
     frames = runner.choose_frames(dataset, jump, n_scans)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
-               TimeElapsedColumn())
-    console = _console(sys.stderr)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("scan pairs", total=len(frames) - 1)
-
-        def on_pair(report: "PairReport") -> None:
-            progress.update(task, advance=1, description=f"scan pairs, {report.frame} done")
-
-        reports = runner.process(dataset, frames, settings, out, viewing, on_pair)
+    with _progress(len(frames) - 1) as on_pair:
+        reports = runner.process(
+            dataset, frames, settings, out, viewing, lambda report: on_pair(report.frame), method)
     print()
     _print(run_table(reports, settings))
     print()
@@ -268,8 +329,6 @@ def _process(
 
 def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None:
     """Log one pair to a file, the live viewer, or both."""
-    import contextlib
-
     import numpy as np
 
     from lidarflow import io, viewer

@@ -182,9 +182,10 @@ def write_json(path: Path, data: Any) -> None:
     _write_text(path, _to_json(data, indent=2) + "\n")
 
 
-def write_toml(path: Path, config: Config) -> None:
-    """Write every setting, in a form that can be read back as a settings file."""
-    _write_text(path, tomli_w.dumps(to_dict(config)))
+def write_toml(path: Path, config: Config, comment: str = "") -> None:
+    """Write every setting, below a `comment`, in a form that can be read back as a settings file."""
+    heading = f"# {comment}\n\n" if comment else ""
+    _write_text(path, heading + tomli_w.dumps(to_dict(config)))
 
 
 def check_output(option: str, path: Path, suffix: str, inputs: tuple[Path, ...] = ()) -> None:

@@ -1,20 +1,19 @@
 """Two scans in, flow out: the method from start to end."""
 
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
-from lidarflow.errors import DataError
 from lidarflow.lidar import dynamic, ego, features, frontend, mesh, preparation, start, uncertainty
 from lidarflow.lidar.attribution import WORLD, Attribution, attribute
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.solve import gtsam_lm
+from lidarflow.stopwatch import Stopwatch
 from lidarflow.types import FlowResult, Scan, ScanPair
 
 
@@ -28,17 +27,11 @@ class Previous:
     tracks: Tracks
 
 
-@dataclass(slots=True)
-class Stopwatch:
-    """Wall time of named stages, in seconds."""
+class Estimator(Protocol):
+    """A method that is shown the scans of a sequence one by one."""
 
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
+    def step(self, scan: Scan) -> FlowResult | None:
+        """Flow from the last scan to this one; None for the first. DataError for a scan of no use."""
 
 
 def estimate_flow(pair: ScanPair, config: Config | None = None) -> FlowResult:
@@ -53,32 +46,31 @@ class FlowEstimator:
 
     def __init__(self, config: Config | None = None):
         self.config = config or Config()
-        limits = self.config.preparation
-        by_registration = self.config.ego.method == "registration"
-        self._odometry = None if by_registration else ego.Odometry(limits.min_range_m, limits.max_range_m)
+        self._odometry = ego.Odometry(self.config)
         self._scan: Scan | None = None
         self._previous: Previous | None = None
 
     def step(self, scan: Scan) -> FlowResult | None:
         """Flow from the last scan to this one; None for the first."""
-        guess = None
-        if self._odometry is not None:
-            guess = self._odometry.step(_finite_in_range(scan, self.config))
+        timed = Stopwatch()
+        with timed("ego-motion"):
+            guess = self._odometry.step(scan.points)
         source, self._scan = self._scan, scan
         if source is None:
-            _require_points(scan, self.config)
+            preparation.require_points(scan, self.config.preparation)
             return None
         # Forgotten first: after a scan that cannot be used, the next pair must not inherit an older one's.
         previous, self._previous = self._previous, None
-        prepared = prepare(ScanPair(source, scan), self.config, previous, guess)
+        prepared = prepare(ScanPair(source, scan), self.config, previous, guess, timed)
         result, tracks = explain(prepared, self.config, previous.tracks if previous else Tracks())
         self._previous = Previous(source.points, result, prepared.target, tracks)
         return result
 
 
-def run(dataset: Dataset, frames: list[int], config: Config) -> Iterator[tuple[ScanPair, FlowResult]]:
-    """Flow of every consecutive pair of `frames` of a data set, in order."""
-    estimator = FlowEstimator(config)
+def run(
+    dataset: Dataset, frames: list[int], estimator: Estimator
+) -> Iterator[tuple[ScanPair, FlowResult]]:
+    """Flow of every consecutive pair of `frames` of a data set, in order, by a fresh estimator."""
     source = None
     for frame in frames:
         scan = dataset.scan(frame)
@@ -102,21 +94,24 @@ class Prepared:
 
 
 def prepare(
-    pair: ScanPair, config: Config, previous: Previous | None = None, ego_guess: np.ndarray | None = None
+    pair: ScanPair, config: Config, previous: Previous | None = None, ego_guess: np.ndarray | None = None,
+    timed: Stopwatch | None = None,
 ) -> Prepared:
     """All of a pair that comes before objects and solver; raises DataError for scans that cannot be used.
 
-    `previous` is what the pair before left, `ego_guess` a start value (4, 4) for its ego-motion.
+    `previous` is what the pair before left, `ego_guess` a start value (4, 4) for its ego-motion, `timed`
+    goes on measuring stages.
     """
+    timed = timed or Stopwatch()
     for scan in (pair.source, pair.target):
-        _require_points(scan, config)
-    timed = Stopwatch()
+        preparation.require_points(scan, config.preparation)
     points = pair.source.points
     with timed("features"):
         source = previous.target if previous else features.extract(pair.source, config)
         target = features.extract(pair.target, config)
     with timed("ego-motion"):
-        ego_motion = _ego_motion(pair, source, target, ego_guess, config)
+        ego_motion = ego.find(
+            points[source.usable], pair.target.points[target.usable], ego_guess, config.ego)
     with timed("mesh"):
         surface_mesh = mesh.build(
             points, source.usable & ~source.ground, source.surface, config.mesh, config.normals.radius_m)
@@ -184,34 +179,6 @@ def _std(
         std_m[rows] = uncertainty.of_matches(graph.problem, motions, config.solver.truncation_m)[solved]
     std_m[~valid] = np.nan
     return std_m
-
-
-def _require_points(scan: Scan, config: Config) -> None:
-    limits = config.preparation
-    if not preparation.usable(scan.points, limits).any():
-        raise DataError(
-            f"{scan.name}: none of {len(scan)} points lies between {limits.min_range_m:g} and "
-            f"{limits.max_range_m:g} m from the sensor; is the scan empty, or not in metres?")
-
-
-def _finite_in_range(scan: Scan, config: Config) -> np.ndarray:
-    return scan.points[preparation.usable(scan.points, config.preparation)]
-
-
-def _ego_motion(
-    pair: ScanPair, source: features.Features, target: features.Features, guess: np.ndarray | None,
-    config: Config,
-) -> np.ndarray:
-    """target_from_source (4, 4): KISS-ICP's, refined unless told otherwise, or by registration alone.
-
-    Both registrations sum in parallel and in no fixed order; rounding their last digits away, a nanometre,
-    makes equal runs give equal bytes.
-    """
-    found = guess
-    if guess is None or config.ego.refine:
-        found = ego.register(
-            pair.source.points[source.usable], pair.target.points[target.usable], guess, config.ego)
-    return pose.exp(np.round(pose.log(found), 9))
 
 
 def _start(

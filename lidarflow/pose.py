@@ -56,6 +56,17 @@ def turn(motion: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return vectors @ motion[:3, :3].T
 
 
+def aligned(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Motions (..., 4, 4) of points (..., K, 3) onto (..., K, 3) by least squares (Kabsch 1976)."""
+    from_mean, to_mean = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
+    left, _, right = np.linalg.svd(np.swapaxes(target - to_mean, -1, -2) @ (source - from_mean))
+    # A mirror image is no rotation: the least certain axis is turned back.
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    rotation = left @ right
+    shift = to_mean[..., 0, :] - (rotation @ from_mean[..., 0, :, None])[..., 0]
+    return from_rotation_translation(rotation, shift)
+
+
 def hat(vector: np.ndarray) -> np.ndarray:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     vector = np.asarray(vector, float)

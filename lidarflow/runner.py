@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, metrics, pipeline, pose, preview, provenance
+from lidarflow import io, methods, metrics, pipeline, pose, preview, provenance
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.errors import DataError, LidarflowError
@@ -68,20 +68,21 @@ def choose_frames(dataset: Dataset, jump: int, count: int | None) -> list[int]:
 
 def process(
     dataset: Dataset, frames: list[int], config: Config, out: Path, viewing: Viewing,
-    on_pair: Callable[[PairReport], None] = lambda report: None,
+    on_pair: Callable[[PairReport], None] = lambda report: None, method: str = methods.OURS,
 ) -> list[PairReport]:
     """Process `frames` of a data set and write a run folder; `on_pair` hears of every finished pair.
 
-    Flow files are complete as soon as they appear; poses, objects, metrics, recording and picture follow.
-    Raises LidarflowError for input or output that cannot be used.
+    `method` is one of methods.METHODS. Flow files are complete as soon as they appear; poses, objects,
+    metrics, recording and picture follow. Raises LidarflowError for input or output that cannot be used.
     """
     # The first pair is done before the folder is touched: a bad data set leaves no empty run behind.
     io.check_run_folder(out)
     reports: list[PairReport] = []
-    results = _explained(pipeline.run(dataset, frames, config), dataset, frames, reports, out)
+    estimator = methods.find(method).along(config)
+    results = _explained(pipeline.run(dataset, frames, estimator), dataset, frames, reports, out)
     first = next(results)
     io.new_run_folder(out)
-    io.write_toml(out / io.CONFIG_FILE, config)
+    io.write_toml(out / io.CONFIG_FILE, config, f"Method: {method}")
     provenance.write(out, provenance.RunSource(dataset.source, tuple(frames)))
     world_from_sensor, times_ns, objects = [np.eye(4)], [], []
     with _recording(out / io.RECORDING_FILE, viewing) as stream:

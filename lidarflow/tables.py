@@ -5,6 +5,7 @@ from rich import box
 from rich.table import Table
 
 from lidarflow import pose
+from lidarflow.compare import Comparison
 from lidarflow.config import Config, describe
 from lidarflow.metrics import Alignment
 from lidarflow.runner import PairReport, figures_of, mean_of, truth_of
@@ -16,6 +17,11 @@ _COLUMNS = {
     "movers_found": "movers\nfound\n[%]", "false_movers": "false\nmovers\n[%]",
     "crispness_before": "crisp\nbefore", "crispness_after": "crisp\nafter",
     "moving_points": "moving\npoints", "objects": "moving\nobjects",
+}
+_COMPARED = {
+    "crispness": "crisp", "epe_static_m": "EPE\nstatic\n[m]", "epe_dynamic_m": "EPE\nmoving\n[m]",
+    "t_e_m": "t_e\n[m]", "r_e_rad": "r_e\n[rad]", "movers_found": "movers\nfound\n[%]",
+    "false_movers": "false\nmovers\n[%]",
 }
 _COUNTS = {"moving_points", "objects"}
 _SHARES = {"movers_found", "false_movers"}
@@ -61,14 +67,41 @@ def run_notes(reports: list[PairReport], config: Config) -> list[str]:
             "graph: the same of the points the graph solved; others have the ego-motion"]
         notes = [f"truth: {truth_of(reports)}", "EPE: mean end-point error of all points", *graph, *notes]
     for report in reports:
-        doubt = _doubt(report.matches, report.alignment)
+        doubt = _doubt(report.matches, report.seconds, report.alignment)
         notes += [f"{report.frame}: {doubt}"] if doubt else []
     return notes
 
 
-def _doubt(matches: int | None, alignment: Alignment) -> str:
-    """What makes a result doubtful, "" for nothing."""
-    if matches == 0:
+def compare_table(found: Comparison) -> Table:
+    """One row per method, means over pairs, 80 characters wide; columns without any value are left out."""
+    rows = {run.name: run.mean() for run in found.runs}
+    shown = [name for name in _COMPARED if any(name in row for row in rows.values())]
+    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, pad_edge=False)
+    table.add_column("method", no_wrap=True)
+    for name in shown:
+        table.add_column(_COMPARED[name], justify="right", no_wrap=True)
+    table.add_column("time\n[s]", justify="right", no_wrap=True)
+    for run in found.runs:
+        row = rows[run.name]
+        table.add_row(run.name, *(_text(name, row.get(name)) for name in shown),
+                      f"{run.median_seconds():.2f}")
+    return table
+
+
+def compare_notes(found: Comparison) -> list[str]:
+    """What the figures of `compare_table` mean."""
+    truth = ", ".join(dict.fromkeys(found.truth))
+    notes = [f"pairs: {len(found.frames)}; means over pairs, time: median after one unmeasured pair",
+             f"crisp: crispness with σ = {found.sigma_m:g} m, 1 = aligned, of all points above ground"]
+    if truth == "none":
+        return ["truth: none found", *notes]
+    return [f"truth: {truth}", *notes, "EPE: mean end-point error of all points with a known truth",
+            "t_e, r_e: error of the motion at a point, of static points above ground"]
+
+
+def _doubt(matches: int | None, seconds: dict[str, float], alignment: Alignment) -> str:
+    """What makes a result doubtful, "" for nothing; `seconds` say whether matches were looked for."""
+    if matches == 0 and "matching" in seconds:
         return "no point found a match, so all of them have the ego-motion"
     if alignment.after < _POOR_CRISPNESS:
         return (f"crispness is only {alignment.after:.3f} after the flow; are these consecutive scans of one "
@@ -81,7 +114,9 @@ def _text(name: str, value: float | None) -> str:
         return "-"
     if name in _COUNTS:
         return f"{value:.0f}"
-    return f"{100 * value:.2f}" if name in _SHARES else f"{value:.3f}"
+    if name in _SHARES:
+        return f"{100 * value:.2f}"
+    return f"{value:.4f}" if name.endswith("_rad") else f"{value:.3f}"
 
 
 def pair_table(pair: ScanPair, result: FlowResult, alignment: Alignment) -> Table:
@@ -107,7 +142,7 @@ def pair_table(pair: ScanPair, result: FlowResult, alignment: Alignment) -> Tabl
     odd_sizes = max(counts) > _ODD_SIZE_RATIO * min(counts)
     if odd_sizes:
         table.add_row("note", f"the scans have {counts[0]} and {counts[1]} points; are both of one sensor?")
-    doubt = _doubt(len(result.match_source), alignment)
+    doubt = _doubt(len(result.match_source), result.seconds, alignment)
     if doubt:
         table.add_row("note", doubt)
     table.add_row("seconds", ", ".join(f"{stage} {s:.1f}" for stage, s in result.seconds.items()))

@@ -41,11 +41,12 @@ def evaluate(job: tuple[Path, int | None, settings.Config]) -> dict:
     folder, n_scans, config = job
     dataset = open_dataset(folder, kitti_correction=config.preparation.kitti_correction)
     frames = runner.choose_frames(dataset, 0, n_scans)
-    for _ in pipeline.run(dataset, frames[:2], config):
+    for _ in pipeline.run(dataset, frames[:2], pipeline.FlowEstimator(config)):
         pass
+    results = pipeline.run(dataset, frames, pipeline.FlowEstimator(config))
     reports = [
         runner.report_pair(dataset, index, pair, result, config)
-        for index, (pair, result) in zip(frames, pipeline.run(dataset, frames, config), strict=False)
+        for index, (pair, result) in zip(frames, results, strict=False)
     ]
     stages = dict.fromkeys(stage for report in reports for stage in report.seconds)
     return {

@@ -9,15 +9,17 @@ from shared_data import ROOT
 PACKAGE = ROOT / "lidarflow"
 LAYERS = [
     {"errors", "__version__"},
-    {"open3d_import", "pose", "robust", "colour", "kernels"},
+    {"open3d_import", "pose", "robust", "colour", "kernels", "stopwatch"},
     {"types"},     # its shape checks use pose
     {"config"},
-    {"lidar", "rgbd", "solve", "datasets", "synthetic", "baselines"},
+    {"lidar", "rgbd", "solve", "datasets", "synthetic"},
+    {"baselines"},
     {"pipeline"},
+    {"methods"},
     {"metrics", "io", "viewer", "preview"},
     {"provenance"},
     {"runner"},
-    {"evaluation"},
+    {"evaluation", "compare"},
     {"tables", "score_tables", "demo"},
     {"cli"},
 ]

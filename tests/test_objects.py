@@ -8,14 +8,14 @@ from scipy.spatial import cKDTree
 from shared_data import SHARED, needs_shared
 
 from lidarflow import pose, synthetic
-from lidarflow.config import Config, ObjectsConfig
+from lidarflow.config import ObjectsConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.lidar import acceptance, clusters, evidence, frontend, objects, rigid_fit
 from lidarflow.lidar import body as body_of
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
 from lidarflow.lidar.surface import Surface
-from lidarflow.pipeline import estimate_flow, run
+from lidarflow.pipeline import FlowEstimator, estimate_flow, run
 from lidarflow.types import FlowProblem, ScanPair
 
 CONFIG = ObjectsConfig()
@@ -246,7 +246,7 @@ def test_a_body_is_completed_by_what_it_surrounds_and_what_follows_it():
 @pytest.mark.parametrize("name", ["kitti_tracked_0005_from_000", "kitti_tracked_0005_from_040"])
 def test_tracked_kitti_drives(name):
     dataset = open_dataset(SHARED / name)
-    for index, (_, result) in enumerate(run(dataset, [0, 1, 2], Config())):
+    for index, (_, result) in enumerate(run(dataset, [0, 1, 2], FlowEstimator())):
         truth = dataset.truth(index)
         error_m = np.linalg.norm(result.flow - truth.flow, axis=1)
         moving, still = truth.is_dynamic & truth.valid, ~truth.is_dynamic & truth.valid
@@ -262,14 +262,14 @@ def test_tracked_kitti_drives(name):
     "name, movers", [("kitti_odometry_00_pair_198", 0), ("kitti_odometry_00_start", 1)])
 def test_static_folders_hold_no_more_than_they_show(name, movers):
     dataset = open_dataset(SHARED / name)
-    (_, result), = run(dataset, [0, 1], Config())
+    (_, result), = run(dataset, [0, 1], FlowEstimator())
     assert len(result.objects) == movers   # a car drives 25 m ahead in the second
 
 
 @needs_shared
 def test_what_moves_in_argoverse_does_so_as_labelled():
     dataset = open_dataset(SHARED / "argoverse2")
-    (_, result), = run(dataset, [0, 1], Config())
+    (_, result), = run(dataset, [0, 1], FlowEstimator())
     truth = dataset.truth(0)
     error_m = np.linalg.norm(result.flow - truth.flow, axis=1)
     moving = truth.is_dynamic & truth.valid

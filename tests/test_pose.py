@@ -158,3 +158,21 @@ def test_arguments_are_not_written_to():
     pose.apply(motion, points), pose.inverse(motion), pose.log(motion), pose.interpolate(motion, motion, 0.5)
     np.testing.assert_array_equal(motion, before[0])
     np.testing.assert_array_equal(points, before[1])
+
+
+def test_alignment_finds_the_motion_of_every_cloud():
+    known = pose.exp(twists(6, 3.0, seed=8))
+    points = rng(9).normal(scale=5.0, size=(6, 12, 3))
+    found = pose.aligned(points, pose.apply(known[:, None], points))
+    np.testing.assert_allclose(found, known, atol=1e-9)
+
+
+def test_alignment_never_mirrors():
+    points = rng(10).normal(size=(10, 3))
+    assert pose.is_rigid(pose.aligned(points, points * [1.0, 1.0, -1.0]))
+
+
+def test_alignment_of_three_points_of_a_plane():
+    known = pose.exp(twists(2, 1.0, seed=11)[1])
+    points = rng(12).normal(size=(3, 3))
+    np.testing.assert_allclose(pose.aligned(points, pose.apply(known, points)), known, atol=1e-9)

@@ -11,11 +11,23 @@ from lidarflow.types import Scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Masks:
+    """Which points of a scan take part.
+
+    usable  (N,) bool   finite, within the range limits, no reflection from under the road
+    ground  (N,) bool   the ground among them
+    """
+
+    usable: np.ndarray
+    ground: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Features:
     """A prepared scan.
 
-    usable       (N,) bool          finite, within the range limits, no reflection from under the road
-    ground       (N,) bool          the ground among them
+    usable       (N,) bool          as in Masks
+    ground       (N,) bool
     surface      (S, 3) float64     thinned non-ground points, metres
     keypoint     (K,) int64         rows of the scan
     descriptors  (K, 352) float32   SHOT of each keypoint, unit norm
@@ -28,19 +40,24 @@ class Features:
     descriptors: np.ndarray
 
 
-def extract(scan: Scan, config: Config) -> Features:
-    """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid and their descriptors."""
+def masks(scan: Scan, config: Config) -> Masks:
+    """The points of `scan` that take part, and the ground among them."""
     usable = preparation.usable(scan.points, config.preparation)
     on_ground = ground.detect(scan.points, usable, config.ground)
-    usable &= ~ground.reflections(scan.points, usable, on_ground)
-    rows = np.flatnonzero(usable & ~on_ground)
+    return Masks(usable & ~ground.reflections(scan.points, usable, on_ground), on_ground)
+
+
+def extract(scan: Scan, config: Config) -> Features:
+    """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid and their descriptors."""
+    seen = masks(scan, config)
+    rows = np.flatnonzero(seen.usable & ~seen.ground)
     surface = _thinned(scan.points[rows], config.shot.surface_voxel_m)
     keypoint = rows[grid.first_per_voxel(scan.points[rows], config.matching.keypoint_voxel_m)]
     descriptors, _ = shot.describe(
         scan.points[keypoint], surface, normals.estimate(surface, surface, config.normals.radius_m),
         config.shot.radius_m, config.shot.min_neighbours)
     described = np.isfinite(descriptors[:, 0])
-    return Features(usable, on_ground, surface, keypoint[described], descriptors[described])
+    return Features(seen.usable, seen.ground, surface, keypoint[described], descriptors[described])
 
 
 def _thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:

@@ -3,6 +3,8 @@
 import numpy as np
 
 from lidarflow.config import PreparationConfig
+from lidarflow.errors import DataError
+from lidarflow.types import Scan
 
 
 def usable(points: np.ndarray, config: PreparationConfig) -> np.ndarray:
@@ -10,3 +12,11 @@ def usable(points: np.ndarray, config: PreparationConfig) -> np.ndarray:
     with np.errstate(invalid="ignore", over="ignore"):
         range_sq = np.einsum("ij,ij->i", points, points)
         return (range_sq >= config.min_range_m**2) & (range_sq <= config.max_range_m**2)
+
+
+def require_points(scan: Scan, config: PreparationConfig) -> None:
+    """Raise DataError for a scan without a point that takes part."""
+    if not usable(scan.points, config).any():
+        raise DataError(
+            f"{scan.name}: none of {len(scan)} points lies between {config.min_range_m:g} and "
+            f"{config.max_range_m:g} m from the sensor; is the scan empty, or not in metres?")

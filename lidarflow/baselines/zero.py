@@ -1,0 +1,13 @@
+"""Nothing moves: what any method has to beat."""
+
+from lidarflow import pose
+from lidarflow.baselines.whole_scan import Registered, WholeScan
+
+
+class Zero(WholeScan):
+    """Every point stays where it is in the sensor's frame."""
+
+    name = "zero"
+
+    def _register(self, pair, source, target) -> Registered:
+        return Registered(pose.identity())

@@ -1,0 +1,147 @@
+"""Several methods on the same scans, scored on the same points."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarflow import methods, metrics, runner
+from lidarflow.config import Config
+from lidarflow.datasets import Dataset
+from lidarflow.errors import ConfigError, LidarflowError
+from lidarflow.lidar import features
+from lidarflow.types import FlowResult, Scan, ScanPair, Truth
+
+
+@dataclass(slots=True)
+class MethodRun:
+    """A method on its way through the scans.
+
+    figures  of every pair: by name, units in the name
+    seconds  of every pair: wall time; the first pair bears the work on both its scans
+    """
+
+    name: str
+    figures: list[dict[str, float]] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+    def mean(self) -> dict[str, float]:
+        """Means over pairs; a figure leaves out pairs without a value, and is left out where all are."""
+        names = dict.fromkeys(name for row in self.figures for name in row)
+        values = {name: [row[name] for row in self.figures if np.isfinite(row[name])] for name in names}
+        return {name: float(np.mean(known)) for name, known in values.items() if known}
+
+    def median_seconds(self) -> float:
+        """Median over pairs."""
+        return float(np.median(self.seconds))
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What every method made of the same pairs.
+
+    frames   names of the source scans
+    truth    what each pair was scored against
+    sigma_m  of crispness
+    """
+
+    runs: list[MethodRun]
+    frames: list[str]
+    truth: list[str]
+    sigma_m: float
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        return {
+            "crispness_sigma_m": self.sigma_m,
+            "frames": self.frames,
+            "truth": self.truth,
+            "methods": {
+                run.name: {"mean": run.mean(), "median_seconds": run.median_seconds(),
+                           "pairs": run.figures, "seconds": run.seconds} for run in self.runs},
+        }
+
+
+def names_of(text: str) -> list[str]:
+    """The methods in a list such as "ours,icp", each once; ConfigError for an unknown one, or none."""
+    names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if not names:
+        raise ConfigError(f"--methods '{text}': names no method; known are {', '.join(methods.METHODS)}")
+    for name in names:
+        methods.find(name)
+    return names
+
+
+def compare(
+    dataset: Dataset, frames: list[int], names: list[str], config: Config,
+    on_pair: Callable[[str], None] = lambda frame: None,
+) -> Comparison:
+    """Run methods in turn on every consecutive pair of `frames`; `on_pair` hears of every finished pair.
+
+    The first pair is processed beforehand as well, unmeasured, so that compiling and imports are not counted.
+    Raises LidarflowError where a method fails, and says which and where.
+    """
+    for _ in _pairs(dataset, frames[:2], [MethodRun(name) for name in names], config):
+        pass
+    runs = [MethodRun(name) for name in names]
+    found = Comparison(runs, [], [], config.crispness.sigma_m)
+    for index, pair, results in _pairs(dataset, frames, runs, config):
+        truth, origin = runner.find_truth(dataset, index, pair)
+        above_ground = _above_ground(pair.source, config)
+        for run, result in zip(runs, results, strict=True):
+            run.figures.append(figures_of(pair, result, truth, above_ground, found.sigma_m))
+        found.frames.append(pair.source.name)
+        found.truth.append(origin)
+        on_pair(pair.source.name)
+    return found
+
+
+def _pairs(dataset: Dataset, frames: list[int], runs: list[MethodRun], config: Config):
+    """Every pair's first index, the pair, and each run's result; scans are read once for all methods."""
+    estimators = [methods.find(run.name).along(config) for run in runs]
+    spent_s = np.zeros(len(runs))
+    source = None
+    for frame in frames:
+        target, results = dataset.scan(frame), []
+        for k, (run, estimator) in enumerate(zip(runs, estimators, strict=True)):
+            begin = time.perf_counter()
+            try:
+                results.append(estimator.step(target))
+            except LidarflowError as error:
+                where = f"method {run.name}, scan {frame} of {dataset.name}"
+                raise type(error)(f"{error} ({where})") from error
+            spent_s[k] += time.perf_counter() - begin
+        if source is not None:
+            for run, seconds in zip(runs, spent_s.tolist(), strict=True):
+                run.seconds.append(seconds)
+            spent_s[:] = 0.0
+            yield frame - 1, ScanPair(source, target), results
+        source = target
+
+
+def figures_of(
+    pair: ScanPair, result: FlowResult, truth: Truth | None, above_ground: np.ndarray, sigma_m: float
+) -> dict[str, float]:
+    """Scores of one method on one pair, on points that do not depend on the method.
+
+    Crispness is of the points in above_ground (N,), t_e and r_e of those among them that are known to stand
+    still; end-point errors are of all points with a known truth.
+    """
+    points = pair.source.points
+    moved = points[above_ground] + result.flow[above_ground]
+    figures = {"crispness": metrics.crispness(moved, pair.target.points, sigma_m)}
+    if truth is None:
+        return figures
+    scores = metrics.score(points, result, truth)
+    rows = truth.valid & ~truth.is_dynamic & above_ground
+    t_e, r_e = metrics.pose_errors(points[rows], result.motions[rows], truth.ego_motion)
+    return figures | {
+        "epe_static_m": scores.static.mean, "epe_dynamic_m": scores.dynamic.mean, "t_e_m": t_e,
+        "r_e_rad": r_e, "movers_found": scores.movers_found, "false_movers": scores.false_movers}
+
+
+def _above_ground(scan: Scan, config: Config) -> np.ndarray:
+    """Mask (N,) of the usable points of a scan that are not ground."""
+    seen = features.masks(scan, config)
+    return seen.usable & ~seen.ground
