@@ -5,14 +5,10 @@ from collections.abc import Callable
 import numpy as np
 
 from lidarflow import pose
+from lidarflow.synthetic import body
 from lidarflow.synthetic.scene import Part, Path
-from lidarflow.synthetic.shapes import Mesh, box, ellipsoid, loft, merged, squircle, tube
+from lidarflow.synthetic.shapes import Mesh, box, ellipsoid, merged, tube
 
-# Height over ground [m], half the depth along x, half the width along y, of a person of 1.75 m.
-_TORSO = ((0.84, 0.10, 0.15), (0.95, 0.13, 0.18), (1.10, 0.11, 0.15), (1.28, 0.13, 0.19), (1.42, 0.10, 0.20),
-          (1.49, 0.06, 0.08), (1.54, 0.05, 0.06))
-_HIP = (0.0, 0.09, 0.90)
-_SHOULDER = (0.0, 0.24, 1.40)
 _LEG_SWING, _ARM_SWING = 0.42, 0.48
 
 
@@ -22,9 +18,9 @@ def pedestrian(
     """Torso with head, two arms and two legs that swing in step with the walking speed."""
     scale = rng.uniform(0.92, 1.08)
     start = rng.uniform(0, 2 * np.pi)
-    step_m = 2 * _HIP[2] * scale * np.sin(_LEG_SWING)
+    step_m = 2 * body.HIP[2] * scale * np.sin(_LEG_SWING)
     phase_per_s = np.pi * speed_m_per_s / step_m
-    leg_m = _HIP[2] * scale
+    leg_m = body.HIP[2] * scale
 
     def phase(time_s: float) -> float:
         return start + phase_per_s * time_s
@@ -38,13 +34,14 @@ def pedestrian(
         path = _swinging(world_from_body, at, lambda time_s: swing * np.sin(phase(time_s)))
         return Part(mesh, f"pedestrian {object_id} {name}", object_id, path)
 
-    arm, leg = _arm(scale), _leg(scale)
+    torso = merged([body.trunk(scale), body.head(scale)])
+    arm, leg = body.arm(scale), body.leg(scale)
     return [
-        Part(_torso(scale), f"pedestrian {object_id} torso", object_id, world_from_body),
-        limb("left leg", leg, _HIP, 1, _LEG_SWING),
-        limb("right leg", leg, _HIP, -1, -_LEG_SWING),
-        limb("left arm", arm, _SHOULDER, 1, -_ARM_SWING),
-        limb("right arm", arm, _SHOULDER, -1, _ARM_SWING),
+        Part(torso, f"pedestrian {object_id} torso", object_id, world_from_body),
+        limb("left leg", leg, body.HIP, 1, _LEG_SWING),
+        limb("right leg", leg, body.HIP, -1, -_LEG_SWING),
+        limb("left arm", arm, body.SHOULDER, 1, -_ARM_SWING),
+        limb("right arm", arm, body.SHOULDER, -1, _ARM_SWING),
     ]
 
 
@@ -56,44 +53,15 @@ def cyclist(object_id: int, world_from_bicycle: Path, rng: np.random.Generator) 
     def leg(name: str, side: int) -> Part:
         path = _swinging(world_from_bicycle, hips * (1, side, 1),
                          lambda time_s: -0.55 + side * 0.30 * np.sin(start + phase_per_s * time_s))
-        return Part(_leg(0.95), f"cyclist {object_id} {name}", object_id, path)
+        return Part(body.leg(0.95), f"cyclist {object_id} {name}", object_id, path)
 
-    body = Part(merged([_bicycle(), _rider()]), f"cyclist {object_id} body", object_id, world_from_bicycle)
-    return [body, leg("left leg", 1), leg("right leg", -1)]
+    frame = Part(merged([_bicycle(), _rider()]), f"cyclist {object_id} body", object_id, world_from_bicycle)
+    return [frame, leg("left leg", 1), leg("right leg", -1)]
 
 
 def _swinging(world_from_body: Path, joint: np.ndarray, angle: Callable[[float], float]) -> Path:
     """The path of a limb that turns by `angle` radians about y through `joint`; forward is negative."""
-
-    def world_from_limb(time_s: float) -> np.ndarray:
-        turn = pose.exp(np.array([0.0, angle(time_s), 0.0, 0.0, 0.0, 0.0]))
-        return world_from_body(time_s) @ pose.from_translation(joint) @ turn
-
-    return world_from_limb
-
-
-def _torso(scale: float) -> Mesh:
-    sections = []
-    for z, half_depth, half_width in _TORSO:
-        ring = squircle(half_depth, half_width, exponent=2.6, count=14)
-        sections.append(np.column_stack([ring, np.full(len(ring), z)]))
-    head = ellipsoid((0.02, 0.0, 1.64), (0.10, 0.08, 0.125))
-    body = merged([loft(np.stack(sections)), head])
-    return Mesh(body.vertices * scale, body.triangles)
-
-
-def _arm(scale: float) -> Mesh:
-    """Hangs from the shoulder at the origin, the elbow a little bent."""
-    line = np.array([[0, 0, 0.04], [0, 0, 0], [0, 0.02, -0.28], [0.08, 0.02, -0.54], [0.10, 0.02, -0.64]])
-    return tube(line * scale, np.array([0.04, 0.055, 0.045, 0.035, 0.04]) * scale, sides=8)
-
-
-def _leg(scale: float) -> Mesh:
-    """Hangs from the hip at the origin, 0.9 m down to the sole."""
-    line = np.array([[0, 0, 0.02], [0, 0, -0.20], [0.01, 0, -0.44], [0, 0, -0.62], [0, 0, -0.86]])
-    limb = tube(line * scale, np.array([0.09, 0.085, 0.06, 0.06, 0.045]) * scale, sides=8)
-    foot = box((0.26 * scale, 0.09 * scale, 0.07 * scale), (0.06 * scale, 0.0, -0.865 * scale))
-    return merged([limb, foot])
+    return body.hinged(world_from_body, joint, lambda time_s: np.array([0.0, angle(time_s), 0.0]))
 
 
 def _bicycle() -> Mesh:

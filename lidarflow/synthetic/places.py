@@ -24,10 +24,10 @@ def room(rng: np.random.Generator, speed_m_per_s: float = 2.0, turn_rad_per_s: f
               surroundings.bush(rng), surroundings.lamp(), surroundings.litter_bin(), car(rng)]
     angles = np.arange(len(things)) * (2 * np.pi / len(things)) + rng.uniform(0, 2 * np.pi)
     placed = [
-        _set_down(thing, 8.5 * np.cos(angle), 6.2 * np.sin(angle), rng.uniform(0, 2 * np.pi))
+        set_down(thing, 8.5 * np.cos(angle), 6.2 * np.sin(angle), rng.uniform(0, 2 * np.pi))
         for thing, angle in zip(things, angles, strict=True)
     ]
-    parts = (Part(_uneven_ground(2 * half_x, 2 * half_y, rng), "ground"), Part(merged(walls), "walls"),
+    parts = (Part(uneven_ground(2 * half_x, 2 * half_y, rng), "ground"), Part(merged(walls), "walls"),
              Part(merged(placed), "things"))
     return Scene(parts, _arc((-1.0, 0.0), speed_m_per_s, turn_rad_per_s))
 
@@ -38,25 +38,26 @@ def one_car(speed_m_per_s: float, rng: np.random.Generator) -> Scene:
     The sensor itself moves at 4 m/s along x, in a slight bend.
     """
     house = moved(surroundings.building(26.0, 9.0, rng), pose.from_translation(np.array([8.0, 14.0, 0.0])))
-    hedge = _set_down(surroundings.hedge(20.0, rng), 8.0, -11.0, 0.0)
+    hedge = set_down(surroundings.hedge(20.0, rng), 8.0, -11.0, 0.0)
     things = [surroundings.tree(rng), surroundings.lamp(), surroundings.tree(rng), surroundings.sign(rng),
               car(rng)]
     places = ((-8.0, 9.0), (3.0, 8.0), (20.0, 8.5), (14.0, -7.5), (2.0, -7.0))
-    placed = [_set_down(thing, x, y, 0.1) for thing, (x, y) in zip(things, places, strict=True)]
-    ground = _uneven_ground(80.0, 80.0, rng)
+    placed = [set_down(thing, x, y, 0.1) for thing, (x, y) in zip(things, places, strict=True)]
+    ground = uneven_ground(80.0, 80.0, rng)
     drive = _arc((9.0, 3.5), speed_m_per_s, 0.0)
     parts = (Part(ground, "ground"), Part(merged([house, hedge, *placed]), "surroundings"),
              Part(car(rng), "car 0", 0, drive))
     return Scene(parts, _arc((0.0, 0.0), 4.0, 0.03))
 
 
-def _set_down(mesh: Mesh, x: float, y: float, yaw: float) -> Mesh:
+def set_down(mesh: Mesh, x: float, y: float, yaw: float) -> Mesh:
     """The mesh turned and set at (x, y) with its lowest point at most at the ground."""
     lift = max(0.0, -float(mesh.vertices[:, 2].min()) - 0.2)
     return moved(mesh, pose.from_yaw(yaw, np.array([x, y, lift])))
 
 
-def _uneven_ground(size_x: float, size_y: float, rng: np.random.Generator) -> Mesh:
+def uneven_ground(size_x: float, size_y: float, rng: np.random.Generator) -> Mesh:
+    """A rectangle around the origin that rises and falls by a few centimetres."""
     share = np.linspace(-0.5, 0.5, 81)
     x, y = np.meshgrid(share * size_x, share * size_y, indexing="ij")
     waves = np.column_stack([rng.uniform(-0.8, 0.8, (4, 2)), rng.uniform(0, 2 * np.pi, 4)])
