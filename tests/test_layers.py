@@ -19,6 +19,7 @@ LAYERS = [
     {"runner"},
     {"evaluation"},
     {"tables", "score_tables", "demo"},
+    {"report"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
