@@ -210,7 +210,7 @@ def test_data_that_are_gone_cost_only_the_error_maps(lidarflow, run, tmp_path):
     gone = replace(source.dataset, folder=tmp_path / "gone")
     provenance.write(run, provenance.RunSource(gone, source.scans))
     text = page_of(lidarflow, run)
-    assert f"No error maps, and arrows taken for scans 0.1 s apart: {gone.folder} is not there" in text
+    assert f"No error maps, and arrows drawn as if scans were 0.1 s apart: {gone.folder} is not there" in text
     assert len(Reader(text).of("img")) == 2
     provenance.write(run, provenance.RunSource(None, source.scans))
     assert "the run was not made from a data folder" in page_of(lidarflow, run)
@@ -226,6 +226,21 @@ def test_metrics_survive_the_way_through_json(made):
         np.testing.assert_equal(after.scores.by_range[-1].high_m, np.inf)
         np.testing.assert_equal(after.scores.by_range[-1].all.mean, before.scores.by_range[-1].all.mean)
         assert np.isfinite(after.scores.graph_static.mean)
+
+
+def test_moving_objects_are_listed_those_seen_longest_first(lidarflow, run):
+    assert "Moving objects" not in page_of(lidarflow, run)
+    size = 4.0, 2.0, 1.5
+    io.write_objects(run / "objects.csv", [
+        ("000000", 7, 40, 9.0, 12.0, 0.0, *size, 0.0, 8.0, 0.0, 0.0, 8.0),
+        ("000000", 9, 10, 30.0, 40.0, 0.0, *size, 0.0, 1.0, 0.0, 0.0, 1.0),
+        ("000001", 9, 30, 3.0, 4.0, 0.0, *size, 0.0, 2.0, 0.0, 0.0, 2.0)])
+    read = Reader(page_of(lidarflow, run))
+    objects = [row for row in read.rows if len(row) == 7 and row[0] in "79"]
+    assert objects == [["9", "2", "000000", "1.5", "4.0 × 2.0 × 1.5", "20", "5.0"],
+                       ["7", "1", "000000", "8.0", "4.0 × 2.0 × 1.5", "40", "15.0"]]
+    (run / "objects.csv").write_text("frame,id\n000000,x\n")
+    assert "run/objects.csv: damaged (ValueError" in lidarflow.complaint("report", "run")
 
 
 @pytest.mark.parametrize(("change", "words"), [

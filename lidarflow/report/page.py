@@ -14,10 +14,10 @@ from lidarflow import __version__, score_tables
 from lidarflow.config import Config, describe, to_dict
 from lidarflow.metrics import POSES_ONLY, Interval
 from lidarflow.report import plots
-from lidarflow.report.reading import Run
+from lidarflow.report.reading import Run, SeenObject
 from lidarflow.tables import run_notes, run_table
 
-_MOST_PAIR_ROWS = 60
+_MOST_PAIR_ROWS, _MOST_OBJECT_ROWS = 60, 25
 _LOW, _HIGH = -1, 1
 _OF_WHOLE_GRAPH = {"t_e_m", "r_e_rad"}
 _OF_MOVERS = {"dynamic_iou", "false_movers"}
@@ -56,7 +56,6 @@ _TILES = {
     "movers_found": ("of the moving points found", 100.0, "{:.1f} %"),
     "false_movers": ("of the static called moving", 100.0, "{:.2f} %"),
     "objects": ("moving objects a pair", 1.0, "{:.1f}"),
-    "crispness_by_ego": ("crispness by ego-motion", 1.0, "{:.3f}"),
     "crispness_after": ("crispness by the flow", 1.0, "{:.3f}"),
 }
 
@@ -149,9 +148,20 @@ def _section(run: Run, name: str) -> dict:
                      for picture in run.pictures],
         "plots": [Markup(svg) for svg in _plots(run)],
         "figures": figure_table(run), "tables": tables,
+        "objects": object_table(run.objects),
+        "objects_left_out": max(0, len(run.objects) - _MOST_OBJECT_ROWS),
         "pairs": _pair_table(run), "left_out": max(0, len(run.pairs) - _MOST_PAIR_ROWS),
         "changed": changed, "kept": kept,
     }
+
+
+def object_table(objects: Sequence[SeenObject]) -> Table:
+    """A row for each of the first objects."""
+    lines = [(str(seen.id), str(seen.pairs), seen.first_frame, _number(seen.speed_m_per_s, 1),
+              " × ".join(_number(metres, 1) for metres in seen.size_m), _number(seen.points, 0),
+              _number(seen.nearest_m, 1)) for seen in objects[:_MOST_OBJECT_ROWS]]
+    return Table(("object", "pairs", "first scan", "speed [m/s]", "length × width × height [m]", "points",
+                  "nearest [m]"), tuple(lines))
 
 
 def _pair_table(run: Run) -> Table:

@@ -1,7 +1,7 @@
 """What the report shows of a run, taken from its folder and from the data that it was made of."""
 
+import csv
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +30,19 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
+class SeenObject:
+    """A moving object by its id; means over the pairs it was seen in, nearest_m from the sensor."""
+
+    id: int
+    pairs: int
+    first_frame: str
+    points: float
+    nearest_m: float
+    size_m: tuple[float, ...]
+    speed_m_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Run:
     """One run as the page shows it.
 
@@ -50,6 +63,7 @@ class Run:
     by_range: tuple[metrics.Interval, ...]
     by_speed: tuple[metrics.Interval, ...]
     pairs: tuple[PairReport, ...]
+    objects: tuple[SeenObject, ...]
     pictures: tuple[Picture, ...]
     note: str
 
@@ -86,7 +100,8 @@ def read_run(run_dir: Path, most_pictured: int = MOST_PICTURED) -> Run:
                         "run again")
     numbers = evenly_chosen(len(pairs), most_pictured)
     drawn, note = _pictures(run_dir, pairs, numbers)
-    return Run(str(run_dir), source, config, **known, pairs=pairs, pictures=drawn, note=note)
+    return Run(str(run_dir), source, config, **known, pairs=pairs,
+               objects=_read_objects(run_dir / io.OBJECTS_FILE), pictures=drawn, note=note)
 
 
 def evenly_chosen(count: int, most: int) -> list[int]:
@@ -122,29 +137,53 @@ def _pictures(run_dir: Path, pairs: tuple[PairReport, ...], numbers: list[int]
               ) -> tuple[tuple[Picture, ...], str]:
     """Pictures of the pairs with these numbers, and why something is missing from them."""
     files = {file.stem: file for file in natural_sorted((run_dir / io.FLOW_FOLDER).glob("*.npz"))}
-    drawn, reasons = [], []
-    known = _as_far_as_known(run_dir, numbers, reasons)
-    for number in numbers:
+    drawn = []
+    known, reason = _known_pairs(run_dir, numbers)
+    for number, (pair, truth) in zip(numbers, known, strict=True):
         frame = pairs[number].frame
         if frame not in files:
             raise DataError(f"{run_dir}: no flow of scan {frame} in {io.FLOW_FOLDER}; was the run cut short? "
                             "run it again")
-        pair, truth = next(known, (None, None))
         drawn.append(_picture(files[frame], frame, pair, truth))
-    if reasons:
-        reasons = [f"No error maps, and arrows taken for scans 0.1 s apart: {reasons[0]}."]
-    elif all(picture.errors is None for picture in drawn):
-        reasons = ["No error maps: the data set has no truth."]
-    return tuple(drawn), "".join(reasons)
+    if reason:
+        return tuple(drawn), f"No error maps, and arrows drawn as if scans were 0.1 s apart: {reason}."
+    if all(picture.errors is None for picture in drawn):
+        return tuple(drawn), "No error maps: the data set has no truth."
+    return tuple(drawn), ""
 
 
-def _as_far_as_known(run_dir: Path, numbers: list[int], reasons: list[str]
-                     ) -> Iterator[tuple[ScanPair, Truth | None]]:
-    """Pairs and truth from the data set; ends early, with the reason added, where it cannot be read."""
+def _known_pairs(run_dir: Path, numbers: list[int]
+                 ) -> tuple[list[tuple[ScanPair | None, Truth | None]], str]:
+    """Pairs and their truth from the data set; none, and the reason, where it cannot be read."""
     try:
-        yield from evaluation.known_pairs(run_dir, numbers)
+        return list(evaluation.known_pairs(run_dir, numbers)), ""
     except (LidarflowError, OSError) as error:
-        reasons.append(str(error))
+        return [(None, None)] * len(numbers), str(error)
+
+
+def _read_objects(file: Path) -> tuple[SeenObject, ...]:
+    """Moving objects of a run, those seen in most pairs first; none where there is no such file."""
+    sightings: dict[int, list[dict[str, str]]] = {}
+    try:
+        with file.open(encoding="utf-8", newline="") as opened:
+            for row in csv.DictReader(opened):
+                sightings.setdefault(int(row["id"]), []).append(row)
+        found = [_object(number, rows) for number, rows in sightings.items()]
+    except FileNotFoundError:
+        return ()
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise DataError(f"{file}: damaged ({type(error).__name__}: {error}); run again") from None
+    return tuple(sorted(found, key=lambda seen: (-seen.pairs, seen.id)))
+
+
+def _object(number: int, rows: list[dict[str, str]]) -> SeenObject:
+    """What the rows of objects.csv with one id say together."""
+    def mean(*names: str) -> tuple[float, ...]:
+        return tuple(float(np.mean([float(row[name]) for row in rows])) for name in names)
+
+    nearest_m = min(float(np.hypot(float(row["x"]), float(row["y"]))) for row in rows)
+    return SeenObject(number, len(rows), rows[0]["frame"], mean("points")[0], nearest_m,
+                      mean("length", "width", "height"), mean("speed_m_per_s")[0])
 
 
 def _picture(file: Path, frame: str, pair: ScanPair | None, truth: Truth | None) -> Picture:

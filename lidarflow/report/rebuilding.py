@@ -32,9 +32,9 @@ def rebuilt(kind: Any, value: Any, name: str) -> Any:
     if kind is float:
         if value is None:
             return np.inf if name.rpartition(".")[2] in _INFINITE else np.nan
-        _check(isinstance(value, int | float) and not isinstance(value, bool), name, "a number")
+        _check(type(value) in (int, float), name, "a number")
         return float(value)
-    _check(isinstance(value, kind) and not isinstance(value, bool), name, kind.__name__)
+    _check(type(value) is kind, name, kind.__name__)
     return value
 
 
@@ -43,14 +43,15 @@ def _rebuilt_dataclass(kind: type, value: Any, name: str) -> Any:
     hints = typing.get_type_hints(kind)
     found = {}
     for field in fields(kind):
-        if field.name in _NOT_WRITTEN and field.name not in value:
+        if field.name in value:
+            found[field.name] = rebuilt(hints[field.name], value[field.name], f"{name}.{field.name}")
+        elif field.name in _NOT_WRITTEN:
             found[field.name] = _NOT_WRITTEN[field.name]()
         else:
-            _check(field.name in value, f"{name}.{field.name}", "there")
-            found[field.name] = rebuilt(hints[field.name], value[field.name], f"{name}.{field.name}")
+            raise ValueError(f"{name}.{field.name} is missing")
     return kind(**found)
 
 
 def _check(fits: bool, name: str, expected: str) -> None:
     if not fits:
-        raise ValueError(f"{name}: expected {expected}" if expected != "there" else f"{name} is missing")
+        raise ValueError(f"{name}: expected {expected}")
