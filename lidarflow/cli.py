@@ -212,6 +212,21 @@ def evaluate(
         print(f"metrics    {out}")
 
 
+@app.command(name="report")
+def write_report(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN_DIR...", help="One run folder or several.")],
+    out: Annotated[Path, typer.Option("--out", help="The page (.html) to write.")] = Path("report.html"),
+) -> None:
+    """Write one HTML page on runs: scores, pictures, error maps, plots, settings."""
+    from lidarflow import io, report
+
+    io.check_output("--out", out, ".html")
+    with _working("reading runs"):
+        read = [report.read_run(run, report.shown_per_run(len(runs))) for run in runs]
+        io.write_text(out, report.page_of(read))
+    print(f"report     {out}")
+
+
 @app.command()
 def view(
     what: Annotated[Path, typer.Argument(help="A run folder, a recording (.rrd) or a flow file (.npz).")],

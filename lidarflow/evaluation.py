@@ -1,7 +1,7 @@
 """Scores of results on disk: a run folder or a flow file, against its data set's truth or a given one."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,6 +82,26 @@ def evaluate_file(file: Path, truth: Path | None) -> Evaluation:
     return Evaluation([_from_files(file, None, truth, 1, config)], config, str(truth))
 
 
+def known_pairs(run_dir: Path, numbers: Sequence[int]) -> Iterator[tuple[ScanPair, Truth | None]]:
+    """The pairs of a run with these numbers, 0 = its first, and what their data set knows of them.
+
+    Raises DataError where the data are not at hand, or are not those of the run.
+    """
+    source = provenance.read(run_dir)
+    if source.dataset is None:
+        raise DataError("the run was not made from a data folder")
+    if not source.dataset.folder.exists():
+        raise DataError(f"{source.dataset.folder} is not there any more")
+    dataset = _opened(source.dataset, None, needed=True, run_dir=run_dir)
+    _check_length(dataset, source.scans, run_dir)
+    for number in numbers:
+        index, following = source.scans[number], source.scans[number + 1]
+        pair = ScanPair(dataset.scan(index), dataset.scan(following))
+        file = run_dir / io.FLOW_FOLDER / f"{pair.source.name}.npz"
+        _check_points(file, io.load_flow(file).points, pair.source, dataset)
+        yield pair, runner.find_truth(dataset, index, pair)[0]
+
+
 def _opened(source: Source | None, data: Path | None, needed: bool, run_dir: Path) -> Dataset | None:
     """The data set of a run; None where it is not at hand and not needed either."""
     if data is not None:
@@ -102,9 +122,7 @@ def _from_dataset(
     config: Config,
 ) -> Iterator[PairReport]:
     """A report for every pair that the run went through, scans read once each."""
-    if max(scans) >= len(dataset):
-        raise DataError(f"{dataset.name}: {len(dataset)} scans, but {run_dir} goes up to scan {max(scans)}; "
-                        "is this the data of the run?")
+    _check_length(dataset, scans, run_dir)
     left = {file.stem: file for file in files}
     target = dataset.scan(scans[0])
     for index, following in itertools.pairwise(scans):
@@ -165,6 +183,13 @@ def _given_truth(place: Path, name: str, rows: int, pairs: int) -> Truth:
         raise DataError(f"{place}: the truth of one scan for {pairs} pairs; "
                         "give a folder with <scan>.npz for each")
     return read_truth(place, rows, name)
+
+
+def _check_length(dataset: Dataset, scans: tuple[int, ...], run_dir: Path) -> None:
+    """Raise DataError unless a data set has all scans that a run went through."""
+    if max(scans) >= len(dataset):
+        raise DataError(f"{dataset.name}: {len(dataset)} scans, but {run_dir} goes up to scan {max(scans)}; "
+                        "is this the data of the run?")
 
 
 def _check_points(file: Path, points: np.ndarray, scan: Scan, dataset: Dataset) -> None:

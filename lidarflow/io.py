@@ -155,7 +155,7 @@ def load_flow(path: Path) -> FlowFile:
 def write_poses_kitti(path: Path, world_from_sensor: np.ndarray) -> None:
     """Write poses (N, 4, 4), a row-major 3x4 matrix per line."""
     rows = world_from_sensor[:, :3].reshape(-1, 12)
-    _write_text(path, "".join(_joined(row) + "\n" for row in rows.tolist()))
+    write_text(path, "".join(_joined(row) + "\n" for row in rows.tolist()))
 
 
 def write_poses_tum(path: Path, world_from_sensor: np.ndarray, times_ns: list[int]) -> None:
@@ -163,7 +163,7 @@ def write_poses_tum(path: Path, world_from_sensor: np.ndarray, times_ns: list[in
     rows = pose.to_translation_quaternion(world_from_sensor).tolist()
     lines = [f"{time_ns // 10**9}.{time_ns % 10**9:09d} {_joined(row)}\n"
              for time_ns, row in zip((int(time_ns) for time_ns in times_ns), rows, strict=True)]
-    _write_text(path, "".join(lines))
+    write_text(path, "".join(lines))
 
 
 def write_objects(path: Path, rows: Iterable[tuple]) -> None:
@@ -174,18 +174,18 @@ def write_objects(path: Path, rows: Iterable[tuple]) -> None:
     for frame, number, points, *values in rows:
         # Adding zero turns -0.0 into 0.0.
         table.writerow([frame, number, points, *(f"{round(float(value), 4) + 0.0:.4f}" for value in values)])
-    _write_text(path, text.getvalue())
+    write_text(path, text.getvalue())
 
 
 def write_json(path: Path, data: Any) -> None:
     """Write plain or numpy data as JSON, keys sorted; numbers that are not finite become null."""
-    _write_text(path, _to_json(data, indent=2) + "\n")
+    write_text(path, _to_json(data, indent=2) + "\n")
 
 
 def write_toml(path: Path, config: Config, comment: str = "") -> None:
     """Write every setting, below a `comment`, in a form that can be read back as a settings file."""
     heading = f"# {comment}\n\n" if comment else ""
-    _write_text(path, heading + tomli_w.dumps(to_dict(config)))
+    write_text(path, heading + tomli_w.dumps(to_dict(config)))
 
 
 def check_output(option: str, path: Path, suffix: str, inputs: tuple[Path, ...] = ()) -> None:
@@ -342,7 +342,8 @@ def _plain(data: Any) -> Any:
     return data
 
 
-def _write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
+    """Write text as UTF-8."""
     with written_aside(path) as aside:
         aside.write_text(text, encoding="utf-8")
 

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from lidarflow import colour, pose
-from lidarflow.types import FlowResult, ScanPair
+from lidarflow.types import FlowResult, Scan, ScanPair
 
 _TEXT = (220, 220, 220)
 _QUIET = (150, 150, 150)
@@ -15,11 +15,13 @@ _SENSOR_M = 0.8
 
 def bird_eye(points: np.ndarray, colours: np.ndarray, is_dynamic: np.ndarray, residual_flow: np.ndarray,
              half_width_m: float = 40.0, size_px: int = 1200, dt_s: float = 0.1,
-             caption: str = "", arrows: tuple[np.ndarray, np.ndarray] | None = None) -> Image.Image:
+             caption: str = "", arrows: tuple[np.ndarray, np.ndarray] | None = None,
+             legend: Image.Image | None = None) -> Image.Image:
     """Picture of a scan from above, moving points on top, an arrow as long as each object moves in a second.
 
     points, residual_flow (N, 3) metres, sensor frame; colours (N, 3) uint8; is_dynamic (N,) bool; arrows are
-    starts (K, 3) in metres and velocities (K, 3) in m/s, one for each group of moving points if not given.
+    starts (K, 3) in metres and velocities (K, 3) in m/s, one for each group of moving points if not given;
+    the legend goes into the upper right corner, the colour wheel of motion if not given.
     """
     scale = size_px / (2.0 * half_width_m)
     pixels = np.full((size_px, size_px, 3), colour.BACKGROUND, np.uint8)
@@ -33,8 +35,9 @@ def bird_eye(points: np.ndarray, colours: np.ndarray, is_dynamic: np.ndarray, re
         arrows = tops, moved / dt_s
     _draw_arrows(draw, *arrows, scale, size_px)
     _draw_scale_bar(draw, scale, size_px)
-    legend_px = size_px // 4
-    image.paste(Image.fromarray(colour.wheel(legend_px)), (size_px - legend_px, 0))
+    if legend is None:
+        legend = Image.fromarray(colour.wheel(size_px // 4))
+    image.paste(legend, (size_px - legend.width, 0))
     margin = size_px // 50
     draw.text((margin, margin), caption, _TEXT, colour.font(size_px / 50))
     return image
@@ -42,13 +45,17 @@ def bird_eye(points: np.ndarray, colours: np.ndarray, is_dynamic: np.ndarray, re
 
 def write_preview(path: Path, pair: ScanPair, result: FlowResult) -> None:
     """Write the bird's-eye picture of a pair's source scan as PNG, whatever the name of `path` ends in."""
-    points = pair.source.points
+    motion_picture(pair.source, result, pair.dt_s).save(path, format="PNG")
+
+
+def motion_picture(source: Scan, result: FlowResult, dt_s: float, size_px: int = 1200) -> Image.Image:
+    """Bird's-eye picture of a scan, coloured by the motion over ground found within `dt_s` seconds."""
+    points = source.points
     residual_flow = result.residual_flow(points)
-    colours = colour.scene_colours(points, residual_flow, result.is_dynamic, pair.dt_s)
-    caption = f"{pair.source.name}: {int(result.is_dynamic.sum())} of {len(points)} points move over ground"
-    image = bird_eye(points, colours, result.is_dynamic, residual_flow, half_width_m=_half_width(points),
-                     dt_s=pair.dt_s, caption=caption, arrows=_arrows_of(result))
-    image.save(path, format="PNG")
+    colours = colour.scene_colours(points, residual_flow, result.is_dynamic, dt_s)
+    caption = f"{source.name}: {int(result.is_dynamic.sum())} of {len(points)} points move over ground"
+    return bird_eye(points, colours, result.is_dynamic, residual_flow, half_width_m=half_width(points),
+                    size_px=size_px, dt_s=dt_s, caption=caption, arrows=_arrows_of(result))
 
 
 def _arrows_of(result: FlowResult) -> tuple[np.ndarray, np.ndarray] | None:
@@ -60,7 +67,7 @@ def _arrows_of(result: FlowResult) -> tuple[np.ndarray, np.ndarray] | None:
     return middles, pose.turn(pose.inverse(result.ego_motion), velocity)
 
 
-def _half_width(points: np.ndarray) -> float:
+def half_width(points: np.ndarray) -> float:
     """Half of the picture's width in metres: most of the scan, at most 40 m."""
     reach_m = np.hypot(points[:, 0], points[:, 1])
     reach_m = reach_m[np.isfinite(reach_m)]

@@ -21,6 +21,7 @@ LAYERS = [
     {"runner"},
     {"evaluation", "compare"},
     {"tables", "score_tables", "demo"},
+    {"report"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
