@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 from cloud_files import write_bin, write_numpy, write_pcd, write_ply
-from command_line import Program, drive, rests, rounded
+from command_line import drive, rests, rounded
 
 from lidarflow import (
     __version__,
@@ -39,24 +39,6 @@ OFF = ("--set", "preparation.kitti_correction=off")
 WRITE = {".bin": write_bin, ".npy": write_numpy,
          ".pcd": lambda file, points: write_pcd(file, "binary", points),
          ".ply": lambda file, points: write_ply(file, "binary_little_endian", points, kind="float")}
-
-
-@pytest.fixture
-def lidarflow(monkeypatch, capsys):
-    return Program(monkeypatch, capsys)
-
-
-@pytest.fixture(scope="session")
-def kitti(tmp_path_factory):
-    """The small drive in KITTI's odometry layout, with truth and poses."""
-    folder = tmp_path_factory.mktemp("drive") / "data"
-    synthetic.write_kitti(folder, drive())
-    return folder
-
-
-@pytest.fixture(scope="session")
-def scans(kitti):
-    return sorted((kitti / "sequences" / "00" / "velodyne").iterdir())
 
 
 @pytest.fixture(scope="session")

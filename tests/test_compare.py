@@ -5,9 +5,9 @@ import os
 
 import numpy as np
 import pytest
-from command_line import Program, drive, rests
+from command_line import drive, rests
 
-from lidarflow import cli, compare, config, io, methods, pose, synthetic, tables
+from lidarflow import cli, compare, config, io, methods, pose, tables
 from lidarflow.config import Config
 from lidarflow.datasets import open_dataset
 from lidarflow.errors import ConfigError, DataError
@@ -17,24 +17,6 @@ from lidarflow.types import FlowResult, Scan, ScanPair, SolveStats
 
 OFF = ("--set", "preparation.kitti_correction=off")
 FAST = ["zero", "icp", "ego"]
-
-
-@pytest.fixture
-def lidarflow(monkeypatch, capsys):
-    return Program(monkeypatch, capsys)
-
-
-@pytest.fixture(scope="session")
-def kitti(tmp_path_factory):
-    """The small drive in KITTI's odometry layout, with truth and poses."""
-    folder = tmp_path_factory.mktemp("drive") / "data"
-    synthetic.write_kitti(folder, drive())
-    return folder
-
-
-@pytest.fixture(scope="session")
-def scans(kitti):
-    return sorted((kitti / "sequences" / "00" / "velodyne").iterdir())
 
 
 # --- one method, instead of ours ---
