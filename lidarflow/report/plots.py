@@ -17,7 +17,11 @@ _TICKS = 4
 
 
 def bars(title: str, labels: Sequence[str], series: Mapping[str, Sequence[float]]) -> str:
-    """Bars side by side at every label; values that are not finite have none. Series are named in COLOURS."""
+    """Bars side by side at every label; values that are not finite have none.
+
+    Series are named in COLOURS; those without a finite value are left out.
+    """
+    series = _with_values(series)
     svg, top = _frame(title, labels, series)
     slot = _INNER_WIDTH / max(1, len(labels))
     width = 0.8 * slot / max(1, len(series))
@@ -36,7 +40,11 @@ def bars(title: str, labels: Sequence[str], series: Mapping[str, Sequence[float]
 
 def lines(title: str, labels: Sequence[str], series: Mapping[str, Sequence[float]],
           top: float | None = None) -> str:
-    """A line with dots for each series, broken where values are not finite; the axis ends at `top`."""
+    """A line with dots for each series, broken where values are not finite; the axis ends at `top`.
+
+    Series are named in COLOURS; those without a finite value are left out.
+    """
+    series = _with_values(series)
     svg, top = _frame(title, labels, series, top)
     slot = _INNER_WIDTH / max(1, len(labels))
     dot = 3.0 if len(labels) <= 60 else 1.5
@@ -78,6 +86,10 @@ def _frame(title: str, labels: Sequence[str], series: Mapping[str, Sequence[floa
         _add(svg, "text", x=left + 14, y=33).text = name
         left += 32 + 6.5 * len(name)
     return svg, top
+
+
+def _with_values(series: Mapping[str, Sequence[float]]) -> dict[str, Sequence[float]]:
+    return {name: values for name, values in series.items() if np.isfinite(values).any()}
 
 
 def _y(value: float, top: float) -> float:
