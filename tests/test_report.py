@@ -257,6 +257,7 @@ def test_moving_objects_are_listed_those_seen_longest_first(lidarflow, run):
     (lambda found: found["mean"].update(t_e_m="far"), "mean.t_e_m: expected a number"),
     (lambda found: found["pairs"][1].pop("alignment"), "pairs[1].alignment is missing"),
     (lambda found: found["pairs"][0]["scores"].update(by_range={}), "scores.by_range: expected a list"),
+    (lambda found: found["pairs"].reverse(), "pair 0 is of scan 000001, but that of the data is of 000000"),
     (lambda found: found.update(pairs=found["pairs"][:1]), "1 pairs, but source.json names 3 scans"),
 ])
 def test_damaged_metrics(lidarflow, run, change, words):

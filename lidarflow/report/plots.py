@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-COLOURS = {"all": "#555555", "static": "#3b76b5", "moving": "#e0533d",
+COLOURS = {"static": "#3b76b5", "moving": "#e0533d",
            "before": "#aaaaaa", "by ego-motion": "#3b76b5", "by the flow": "#2d9a5f"}
 _WIDTH, _HEIGHT = 560.0, 270.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54.0, 12.0, 46.0, 44.0
@@ -97,11 +97,11 @@ def _y(value: float, top: float) -> float:
 
 
 def _round_up(value: float) -> float:
-    """The next value above that is 1, 2, 2.5 or 5 times a power of ten, for an axis with round ticks."""
+    """The next value up that is a short number, so that the ticks of an axis are too."""
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
-    return next(step * power for step in (1.0, 2.0, 2.5, 4.0, 5.0, 8.0, 10.0, 20.0) if step * power >= value)
+    return next(step * power for step in (1.0, 2.0, 2.5, 4.0, 5.0, 8.0, 10.0) if step * power >= value)
 
 
 def _unbroken(places: Sequence[tuple[float, float] | None]) -> list[list[tuple[float, float]]]:
