@@ -217,7 +217,7 @@ def write_report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN_DIR...", help="One run folder or several.")],
     out: Annotated[Path, typer.Option("--out", help="The page (.html) to write.")] = Path("report.html"),
 ) -> None:
-    """Write one HTML page on runs: scores, pictures, error maps, plots, settings."""
+    """Write one HTML page on runs: scores, pictures, settings."""
     from lidarflow import io, report
 
     io.check_output("--out", out, ".html")

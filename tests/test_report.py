@@ -158,7 +158,7 @@ def test_names_are_text_not_markup(lidarflow, run, tmp_path):
 def test_runs_of_the_same_data_are_compared(lidarflow, run, made, tmp_path):
     worse = shutil.copytree(run, tmp_path / "worse")
     found = json.loads((worse / "metrics.json").read_text())
-    found["mean"] |= {"epe_static_m": 2 * OFF_M, "strict_accuracy": 0.5}
+    found["mean"] |= {"epe_static_m": 2 * OFF_M, "strict_accuracy": 0.5, "crispness_after": 0.99}
     io.write_json(worse / "metrics.json", found)
     text = page_of(lidarflow, worse, run)
     read = Reader(text)
@@ -166,6 +166,13 @@ def test_runs_of_the_same_data_are_compared(lidarflow, run, made, tmp_path):
     assert read.row("end-point error, static [m]") == [f"{2 * OFF_M:.3f}", f"*{OFF_M:.3f}"]
     assert read.row("strict accuracy [%]") == ["50.00", "*100.00"]
     assert read.row("moving points found [%]") == ["100.00", "100.00"], "none is better"
+    assert "*" in read.row("crispness by the flow")[0]
+    found["mean"] |= {"crispness_before": 0.1}
+    del found["mean"]["strict_accuracy"]
+    io.write_json(worse / "metrics.json", found)
+    read = Reader(page_of(lidarflow, worse, run))
+    assert "*" not in "".join(read.row("crispness by the flow")), "of other points"
+    assert read.row("strict accuracy [%]") == ["-", "100.00"], "there is nothing to be better than"
     assert text.index("The runs compared") < text.index("2 of 2 pairs pictured")
 
 
@@ -176,6 +183,7 @@ def test_runs_of_other_data_are_not_ranked(lidarflow, run, tmp_path):
     found["pairs"] = found["pairs"][1:]
     found["mean"]["epe_static_m"] = 2 * OFF_M
     io.write_json(other / "metrics.json", found)
+    assert Reader(page_of(lidarflow, other)).row("strict accuracy [%]") == ["100.00"], "one pair"
     text = page_of(lidarflow, other, run)
     assert 'class="best"' not in text and "none is called the best" in text
     assert "1 of 1 pairs pictured" in text
@@ -249,6 +257,7 @@ def test_moving_objects_are_listed_those_seen_longest_first(lidarflow, run):
     (lambda found: found["mean"].update(t_e_m="far"), "mean.t_e_m: expected a number"),
     (lambda found: found["pairs"][1].pop("alignment"), "pairs[1].alignment is missing"),
     (lambda found: found["pairs"][0]["scores"].update(by_range={}), "scores.by_range: expected a list"),
+    (lambda found: found["pairs"].reverse(), "pair 0 is of scan 000001, but that of the data is of 000000"),
     (lambda found: found.update(pairs=found["pairs"][:1]), "1 pairs, but source.json names 3 scans"),
 ])
 def test_damaged_metrics(lidarflow, run, change, words):
@@ -324,3 +333,4 @@ def test_lines_break_where_values_are_missing():
     svg = plots.lines("t", list("abcd"), {"static": [0.1, 0.2, np.nan, 0.3]}, top=1.0)
     assert svg.count("<polyline") == 2 and svg.count("<circle") == 3
     assert plots.lines("t", [], {"static": []}).count("<circle") == 0
+    assert "moving" not in plots.lines("t", ["a"], {"static": [1.0], "moving": [np.nan]})

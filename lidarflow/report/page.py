@@ -46,7 +46,7 @@ _FIGURES = {
     "crispness_before": ("crispness before any motion", 1.0, 3, 0),
     "crispness_by_ego": ("crispness by ego-motion", 1.0, 3, _HIGH),
     "crispness_after": ("crispness by the flow", 1.0, 3, _HIGH),
-    "valid_share": ("points whose motion rests on evidence [%]", 100.0, 2, _HIGH),
+    "valid_share": ("points whose motion rests on evidence [%]", 100.0, 2, 0),
     "moving_points": ("points called moving", 1.0, 0, 0),
     "objects": ("moving objects", 1.0, 1, 0),
 }
@@ -89,7 +89,7 @@ def names_of(places: Sequence[str]) -> list[str]:
 
 
 def comparison(runs: Sequence[Run], names: Sequence[str]) -> Table:
-    """Means of all runs side by side; the best stand out where all are of the same scans and truth."""
+    """Means of all runs side by side; the best stand out where all are of the same points and truth."""
     lines = [("data", *(_data_text(run) for run in runs)), ("truth", *(run.truth for run in runs)),
              ("pairs", *(str(len(run.pairs)) for run in runs))]
     marked = set()
@@ -98,7 +98,7 @@ def comparison(runs: Sequence[Run], names: Sequence[str]) -> Table:
         if not np.isfinite(values).any():
             continue
         texts = [_number(value * factor, digits) for value in values]
-        if better and _same_data(runs) and len(set(texts)) > 1:
+        if better and _ranked(runs, figure) and len(set(texts)) > 1 and np.isfinite(values).sum() > 1:
             best = texts[int(np.nanargmax(better * values))]
             marked |= {(len(lines), k + 1) for k, text in enumerate(texts) if text == best}
         lines.append((title, *texts))
@@ -106,12 +106,14 @@ def comparison(runs: Sequence[Run], names: Sequence[str]) -> Table:
 
 
 def figure_table(run: Run) -> Table:
-    """Mean ± standard deviation over pairs of the main figures that the run has."""
-    lines = [(title, f"{_number(run.mean[name] * factor, digits)} ± "
-                     f"{_number(run.std.get(name, np.nan) * factor, digits)}")
-             for name, (title, factor, digits, _) in _FIGURES.items()
-             if np.isfinite(_mean(run, name))]
-    return Table(("mean ± deviation over pairs", ""), tuple(lines))
+    """Mean ± standard deviation over pairs of the figures that the run has; one pair has no deviation."""
+    several = len(run.pairs) > 1
+    lines = []
+    for name, (title, factor, digits, _) in _FIGURES.items():
+        if np.isfinite(_mean(run, name)):
+            deviation = f" ± {_number(run.std.get(name, np.nan) * factor, digits)}" if several else ""
+            lines.append((title, _number(run.mean[name] * factor, digits) + deviation))
+    return Table(("mean ± deviation over pairs" if several else "of the only pair", ""), tuple(lines))
 
 
 def _mean(run: Run, figure: str) -> float:
@@ -224,6 +226,13 @@ def _of_rich(table: RichTable) -> Table:
 
 def _same_data(runs: Sequence[Run]) -> bool:
     return len({(run.source.dataset, run.source.scans, run.truth) for run in runs}) == 1
+
+
+def _ranked(runs: Sequence[Run], figure: str) -> bool:
+    """Whether a better figure is a better run; crispness is of points above the ground that a run found."""
+    if figure.startswith("crispness"):
+        return len({round(_mean(run, "crispness_before"), 3) for run in runs}) == 1 and _same_data(runs)
+    return _same_data(runs)
 
 
 def _data_text(run: Run) -> str:

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-COLOURS = {"all": "#555555", "static": "#3b76b5", "moving": "#e0533d",
+COLOURS = {"static": "#3b76b5", "moving": "#e0533d",
            "before": "#aaaaaa", "by ego-motion": "#3b76b5", "by the flow": "#2d9a5f"}
 _WIDTH, _HEIGHT = 560.0, 270.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54.0, 12.0, 46.0, 44.0
@@ -17,7 +17,11 @@ _TICKS = 4
 
 
 def bars(title: str, labels: Sequence[str], series: Mapping[str, Sequence[float]]) -> str:
-    """Bars side by side at every label; values that are not finite have none. Series are named in COLOURS."""
+    """Bars side by side at every label; values that are not finite have none.
+
+    Series are named in COLOURS; those without a finite value are left out.
+    """
+    series = _with_values(series)
     svg, top = _frame(title, labels, series)
     slot = _INNER_WIDTH / max(1, len(labels))
     width = 0.8 * slot / max(1, len(series))
@@ -36,7 +40,11 @@ def bars(title: str, labels: Sequence[str], series: Mapping[str, Sequence[float]
 
 def lines(title: str, labels: Sequence[str], series: Mapping[str, Sequence[float]],
           top: float | None = None) -> str:
-    """A line with dots for each series, broken where values are not finite; the axis ends at `top`."""
+    """A line with dots for each series, broken where values are not finite; the axis ends at `top`.
+
+    Series are named in COLOURS; those without a finite value are left out.
+    """
+    series = _with_values(series)
     svg, top = _frame(title, labels, series, top)
     slot = _INNER_WIDTH / max(1, len(labels))
     dot = 3.0 if len(labels) <= 60 else 1.5
@@ -80,16 +88,20 @@ def _frame(title: str, labels: Sequence[str], series: Mapping[str, Sequence[floa
     return svg, top
 
 
+def _with_values(series: Mapping[str, Sequence[float]]) -> dict[str, Sequence[float]]:
+    return {name: values for name, values in series.items() if np.isfinite(values).any()}
+
+
 def _y(value: float, top: float) -> float:
     return _TOP + _INNER_HEIGHT * (1.0 - min(max(value / top, 0.0), 1.0))
 
 
 def _round_up(value: float) -> float:
-    """The next value above that is 1, 2, 2.5 or 5 times a power of ten, for an axis with round ticks."""
+    """The next value up that is a short number, so that the ticks of an axis are too."""
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
-    return next(step * power for step in (1.0, 2.0, 2.5, 4.0, 5.0, 8.0, 10.0, 20.0) if step * power >= value)
+    return next(step * power for step in (1.0, 2.0, 2.5, 4.0, 5.0, 8.0, 10.0) if step * power >= value)
 
 
 def _unbroken(places: Sequence[tuple[float, float] | None]) -> list[list[tuple[float, float]]]:

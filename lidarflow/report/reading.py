@@ -144,6 +144,9 @@ def _pictures(run_dir: Path, pairs: tuple[PairReport, ...], numbers: list[int]
         if frame not in files:
             raise DataError(f"{run_dir}: no flow of scan {frame} in {io.FLOW_FOLDER}; was the run cut short? "
                             "run it again")
+        if pair is not None and pair.source.name != frame:
+            raise DataError(f"{run_dir / io.METRICS_FILE}: pair {number} is of scan {frame}, but that of the "
+                            f"data is of {pair.source.name}; run again")
         drawn.append(_picture(files[frame], frame, pair, truth))
     if reason:
         return tuple(drawn), f"No error maps, and arrows drawn as if scans were 0.1 s apart: {reason}."
