@@ -10,8 +10,10 @@ PACKAGE = ROOT / "lidarflow"
 LAYERS = [
     {"errors", "__version__"},
     {"open3d_import", "pose", "robust", "colour", "kernels"},
-    {"types"},     # its shape checks use pose
+    {"checks"},    # they use pose
+    {"types", "rgbd_types"},
     {"config"},
+    {"rgbd_config"},
     {"lidar", "rgbd", "solve", "datasets", "synthetic", "baselines"},
     {"pipeline"},
     {"metrics", "io", "viewer", "preview"},
