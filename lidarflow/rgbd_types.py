@@ -166,3 +166,25 @@ class RgbdResult:
     def residual_flow(self) -> np.ndarray:
         """What points do by themselves (H, W, 3) float32 in metres, in the axes of the target camera."""
         return self.flow - self.odometry_flow()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RgbdTruth:
+    """What really happened between a frame and the next, images (H, W) of the source frame's size.
+
+    flow        (H, W, 3) float32   metres, total: p + flow is what the target's camera sees of p
+    odometry    (4, 4) float64      target_from_source of the static world
+    valid       (H, W) bool         pixels that are known and count in scores
+    is_dynamic  (H, W) bool         what is seen there moves by itself
+    """
+
+    flow: np.ndarray
+    odometry: np.ndarray
+    valid: np.ndarray
+    is_dynamic: np.ndarray
+
+    def __post_init__(self):
+        check("RgbdTruth.valid", self.valid, (None, None), "b")
+        check("RgbdTruth.flow", self.flow, (*self.valid.shape, 3), "f")
+        check("RgbdTruth.is_dynamic", self.is_dynamic, self.valid.shape, "b")
+        check_motion("RgbdTruth.odometry", self.odometry)
