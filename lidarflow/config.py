@@ -8,7 +8,7 @@ import difflib
 import sys
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 from lidarflow.errors import ConfigError
 
@@ -16,6 +16,8 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+Settings = TypeVar("Settings")   # a frozen dataclass whose fields are sections, such as Config or RgbdConfig
 
 
 def setting(default: Any, effect: str, *, low: float | None = None, high: float | None = None,
@@ -165,12 +167,14 @@ class Config:
     crispness: CrispnessConfig = field(default_factory=CrispnessConfig)
 
 
-def load(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Config:
-    """Defaults, then a TOML file, then overrides such as "mesh.max_edge_m=0.5".
+def load(
+    file: Path | None = None, overrides: tuple[str, ...] = (), kind: type[Settings] = Config
+) -> Settings:
+    """Defaults of a `kind` of settings, then a TOML file, then overrides such as "mesh.max_edge_m=0.5".
 
     Raises ConfigError for a file that cannot be read, an unknown key, or a value out of range.
     """
-    config = Config()
+    config = kind()
     if file is not None:
         config = updated(config, _read_toml(Path(file)), str(file))
     for override in overrides:
@@ -178,7 +182,7 @@ def load(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Config:
     return config
 
 
-def updated(config: Config, changes: dict, origin: str = "settings") -> Config:
+def updated(config: Settings, changes: dict, origin: str = "settings") -> Settings:
     """A copy of `config` with nested `changes` {section: {name: value}}, each of them checked."""
     sections = {f.name for f in fields(config)}
     for section, values in changes.items():
@@ -192,15 +196,15 @@ def updated(config: Config, changes: dict, origin: str = "settings") -> Config:
     return config
 
 
-def to_dict(config: Config) -> dict:
+def to_dict(config: Settings) -> dict:
     """Nested plain values, ready for TOML or JSON."""
     return asdict(config)
 
 
-def describe() -> list[tuple[str, str, str, str]]:
-    """Rows (key, default, allowed, effect) for every setting."""
+def describe(kind: type[Settings] = Config) -> list[tuple[str, str, str, str]]:
+    """Rows (key, default, allowed, effect) for every setting of a `kind`."""
     rows = []
-    for section in fields(Config):
+    for section in fields(kind):
         defaults = section.default_factory()
         for f in fields(defaults):
             meta = f.metadata
