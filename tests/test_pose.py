@@ -158,3 +158,11 @@ def test_arguments_are_not_written_to():
     pose.apply(motion, points), pose.inverse(motion), pose.log(motion), pose.interpolate(motion, motion, 0.5)
     np.testing.assert_array_equal(motion, before[0])
     np.testing.assert_array_equal(points, before[1])
+
+
+def test_a_trajectory_undoes_its_steps():
+    steps = pose.exp(np.random.default_rng(3).normal(scale=0.3, size=(4, 6)))
+    poses = pose.trajectory(steps)
+    np.testing.assert_array_equal(poses[0], np.eye(4))
+    np.testing.assert_allclose(pose.inverse(poses[1:]) @ poses[:-1], steps, atol=1e-12)
+    assert pose.trajectory(np.empty((0, 4, 4))).shape == (1, 4, 4)
