@@ -176,7 +176,7 @@ def load(
     """
     config = kind()
     if file is not None:
-        config = updated(config, _read_toml(Path(file)), str(file))
+        config = updated(config, read_toml(Path(file)), str(file))
     for override in overrides:
         config = updated(config, _parse_override(override), "--set")
     return config
@@ -220,11 +220,12 @@ def _range_text(meta: dict) -> str:
     return f"≥ {low:g}" if high is None else f"{low:g} .. {high:g}"
 
 
-def _read_toml(file: Path) -> dict:
+def read_toml(file: Path, what: str = "settings") -> dict:
+    """The content of a TOML file, which messages call a file of `what`; ConfigError if it cannot be read."""
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ConfigError(f"{file}: no such settings file") from None
+        raise ConfigError(f"{file}: no such {what} file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read ({error})") from None
     except tomllib.TOMLDecodeError as error:

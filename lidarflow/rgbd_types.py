@@ -12,6 +12,8 @@ import numpy as np
 from lidarflow import pose
 from lidarflow.checks import check, check_motion
 
+_LUMA = np.array([0.299, 0.587, 0.114], np.float32)     # ITU-R BT.601
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -88,6 +90,13 @@ class RgbdFrame:
             object.__setattr__(self, name, image)
         if self.intensity.size and self.intensity.max() > 1:
             raise ValueError(f"{self.name}: intensity must lie in 0 .. 1, got {self.intensity.max():g}")
+
+    @classmethod
+    def from_color(cls, color: np.ndarray, depth: np.ndarray, time_ns: int = 0,
+                   name: str = "frame") -> "RgbdFrame":
+        """A frame of an RGB image (H, W, 3) uint8, whose luma is the intensity, and depth (H, W) in metres."""
+        intensity = np.clip(color.astype(np.float32) / 255.0 @ _LUMA, 0.0, 1.0)
+        return cls(intensity, depth, time_ns, name, color)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -12,7 +12,6 @@ from lidarflow.synthetic.raycast import raycasting_scene
 from lidarflow.synthetic.rooms import TexturedScene
 
 DYNAMIC_SPEED_M_PER_S = 0.1
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)     # ITU-R BT.601
 _LIGHT = np.array([-0.45, 0.35, 0.82])                 # where it comes from, world
 _AMBIENT = 0.72
 _JUMP_SHARE = 0.05                                     # of the depth: a larger step is an edge
@@ -28,7 +27,7 @@ class RgbdSensor:
     min_depth_m          float   nothing is read nearer
     max_depth_m          float   or farther
     baseline_m           float   from camera to projector: what its light does not reach has no depth
-    dark_level           float   most pixels darker than this (0..1) have no depth
+    dark_level           float   most pixels with less light than this (0..1) have no depth
     loss                 float   chance that any other pixel has none; at depth edges it is half
     image_noise          float   standard deviation of the colour channels, 0..1
     """
@@ -135,11 +134,10 @@ def _read(view: _View, sensor: RgbdSensor, time_ns: int, name: str, rng: np.rand
     noise_m = sensor.depth_noise_per_m * true_depth**2 * rng.normal(size=len(true_depth))
     lost = ~view.lit | (view.facing < 0.08) | (chance < sensor.loss)
     lost |= (view.depth < sensor.min_depth_m) | (view.depth > sensor.max_depth_m)
-    lost |= (view.colours @ LUMA < sensor.dark_level) & (chance < 0.8)
+    lost |= (view.colours.mean(axis=1) < sensor.dark_level) & (chance < 0.8)
     lost |= _at_edges(true_depth.reshape(shape)).ravel() & (chance < 0.5)
     depth = np.where(lost, 0.0, true_depth + noise_m).astype(np.float32).reshape(shape)
-    intensity = np.clip(color.astype(np.float32) / 255.0 @ LUMA, 0.0, 1.0)
-    return RgbdFrame(intensity.reshape(shape), depth, time_ns, name, color.reshape(*shape, 3))
+    return RgbdFrame.from_color(color.reshape(*shape, 3), depth, time_ns, name)
 
 
 def _at_edges(depth: np.ndarray) -> np.ndarray:
