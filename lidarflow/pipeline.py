@@ -1,9 +1,7 @@
 """Two scans in, flow out: the method from start to end."""
 
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +11,7 @@ from lidarflow.datasets import Dataset
 from lidarflow.errors import DataError
 from lidarflow.lidar import dynamic, ego, features, frontend, mesh, objects, preparation, start
 from lidarflow.solve import gtsam_lm
+from lidarflow.stopwatch import Stopwatch
 from lidarflow.types import FlowResult, MovingObject, Scan, ScanPair
 
 
@@ -23,19 +22,6 @@ class Previous:
     points: np.ndarray
     result: FlowResult
     target: features.Features
-
-
-@dataclass(slots=True)
-class Stopwatch:
-    """Wall time of named stages, in seconds."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
 
 
 def estimate_flow(pair: ScanPair, config: Config | None = None) -> FlowResult:

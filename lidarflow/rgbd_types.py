@@ -134,6 +134,7 @@ class RgbdResult:
     odometry         (4, 4) float64      target_from_source of the static world
     is_dynamic       (H, W) bool         pixels of clusters that move
     camera           Camera              of the working size
+    centres          (K, 3) float32      metres, the clusters' centres, source camera frame
     seconds          dict                wall time of each stage
     """
 
@@ -146,6 +147,7 @@ class RgbdResult:
     odometry: np.ndarray
     is_dynamic: np.ndarray
     camera: Camera
+    centres: np.ndarray
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -157,6 +159,7 @@ class RgbdResult:
         check("RgbdResult.is_dynamic", self.is_dynamic, shape, "b")
         check("RgbdResult.b", self.b, (None,), "f")
         check("RgbdResult.cluster_motions", self.cluster_motions, (len(self.b), 4, 4), "f")
+        check("RgbdResult.centres", self.centres, (len(self.b), 3), "f")
         check_motion("RgbdResult.odometry", self.odometry)
         if self.label.size and not -1 <= self.label.min() <= self.label.max() < max(len(self.b), 1):
             raise ValueError(f"RgbdResult.label: expected -1 .. {len(self.b) - 1}")

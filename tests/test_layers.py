@@ -9,7 +9,7 @@ from shared_data import ROOT
 PACKAGE = ROOT / "lidarflow"
 LAYERS = [
     {"errors", "__version__"},
-    {"open3d_import", "pose", "robust", "colour", "kernels"},
+    {"open3d_import", "pose", "robust", "colour", "kernels", "stopwatch"},
     {"checks"},    # they use pose
     {"types", "rgbd_types"},
     {"config"},

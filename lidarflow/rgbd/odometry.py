@@ -1,0 +1,49 @@
+"""Robust odometry before anything is known about what moves (Jaimez et al. 2017, section IV-A)."""
+
+import numpy as np
+
+from lidarflow import pose
+from lidarflow.kernels import alignment
+from lidarflow.rgbd.clusters import Clusters
+from lidarflow.rgbd.pyramid import Level
+from lidarflow.rgbd_config import AlignmentConfig, RgbdConfig
+
+_NO_NOISE_MODEL = np.ones(2, np.float32)
+
+
+def robust(
+    source: tuple[Level, ...], target: tuple[Level, ...], clusters: Clusters, b_before: np.ndarray,
+    config: RgbdConfig,
+) -> np.ndarray:
+    """target_from_source (4, 4) of most of the image: eqs. 3 to 7, coarse to fine.
+
+    Pixels weigh Z1 (1 − B^T), with `b_before` (K,) the previous pair's segmentation in this pair's clusters.
+    """
+    static = np.append(np.clip(1.0 - b_before, 0.0, 1.0), 0.0).astype(np.float32)
+    motion = np.eye(4)
+    for level in reversed(range(len(source))):
+        weight = source[level].points[..., 2] * static[clusters.labels[level]]
+        for _ in range(config.robust.max_warps):
+            system = alignment.linearise(
+                source[level].packed, target[level].packed, source[level].intrinsics, rows34(motion), weight,
+                _NO_NOISE_MODEL, np.float32(0.0), np.float32(config.alignment.max_jump_m))
+            twist = solve(*system, config.robust.cauchy_scale, config.alignment)
+            motion = pose.exp(twist) @ motion
+            if np.linalg.norm(twist) < config.robust.small_step:
+                break
+    return motion
+
+
+def rows34(motion: np.ndarray) -> np.ndarray:
+    """The upper rows (..., 3, 4) float32 of motions (..., 4, 4), as kernels take them."""
+    return np.ascontiguousarray(motion[..., :3, :], np.float32)
+
+
+def solve(
+    system: np.ndarray, count: int, largest_weights: np.ndarray, cauchy_scale: float, config: AlignmentConfig
+) -> np.ndarray:
+    """Twist (6,) of the equations that `alignment.linearise` made; weights are divided by the largest."""
+    scales = np.array([config.photometric_weight, 1.0]) / np.maximum(largest_weights, 1e-12)
+    return alignment.solve(
+        system, count, scales, cauchy_scale, config.max_irls_rounds, config.min_gain, config.min_step,
+        config.damping)
