@@ -36,7 +36,7 @@ def living_room(rng: np.random.Generator) -> TexturedScene:
     """
     parts, colours = _furnished_room(rng)
     crate = shifted(box((0.5, 0.5, 0.6)), z=0.3)
-    parts.append(Part(crate, "box", 0, _straight((2.4, 0.75, 0.45), (0.05, -0.7, 0.0), 0.4)))
+    parts.append(Part(crate, "box", 0, _straight((2.4, 0.75, 0.45), (-0.45, -0.8, 0.0), 0.4)))
     colours.append((0.80, 0.62, 0.35))
     walk = _straight((2.1, -0.85, 0.0), (0.0, 1.2, 0.0), np.pi / 2)
     for part in pedestrian(1, walk, 1.2, rng):
@@ -46,11 +46,11 @@ def living_room(rng: np.random.Generator) -> TexturedScene:
 
 
 def passing_wardrobe(rng: np.random.Generator) -> TexturedScene:
-    """The same room, half of which is hidden by a wardrobe (object 0) that is carried past the camera."""
+    """The same room; a wardrobe (object 0) is carried in from the left and hides half of it after 0.6 s."""
     parts, colours = _furnished_room(rng)
     wardrobe = shifted(merged([box((0.6, 1.3, 2.2)), box((0.1, 0.5, 0.8), (-0.3, 0.3, 0.25)),
                                box((0.16, 0.25, 0.5), (-0.32, -0.35, -0.2))]), z=1.1)
-    parts.append(Part(wardrobe, "wardrobe", 0, _straight((1.95, 0.55, 0.1), (0.25, -0.6, 0.0), 0.15)))
+    parts.append(Part(wardrobe, "wardrobe", 0, _straight((1.6, 1.5, 0.1), (0.1, -1.6, 0.0), 0.15)))
     colours.append((0.70, 0.50, 0.35))
     return _textured(parts, colours, rng)
 

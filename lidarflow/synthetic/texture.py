@@ -44,13 +44,12 @@ class Texture:
 def random_texture(colour: tuple[float, float, float], rng: np.random.Generator) -> Texture:
     """Noise around an RGB `colour` in 0..1, wavelengths from SHORTEST_M to LONGEST_M metres.
 
-    Amplitudes grow with the square root of the wavelength: detail at every distance, as in pictures of rooms.
+    Every octave has the same energy, as in pictures of natural scenes.
     """
     wavelength_m = np.exp(rng.uniform(np.log(SHORTEST_M), np.log(LONGEST_M), _WAVES))
     direction = rng.normal(size=(_WAVES, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    amplitudes = np.sqrt(wavelength_m)
-    amplitudes *= np.sqrt(2.0) / np.linalg.norm(amplitudes)
+    amplitudes = np.full(_WAVES, np.sqrt(2.0 / _WAVES))
     waves = 2.0 * np.pi / wavelength_m[:, None] * direction
     phases = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
     colour = np.array(colour)
