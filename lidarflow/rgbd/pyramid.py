@@ -33,13 +33,7 @@ def build(frame: RgbdFrame, camera: Camera, config: ImagesConfig) -> tuple[Level
 
     Raises DataError for a frame without any depth.
     """
-    if not frame.depth.any():
-        raise DataError(f"{frame.name}: no pixel has a depth; is this the right depth image?")
-    camera = working_camera(camera, config)
-    intensity, depth = frame.intensity, frame.depth
-    if (camera.height, camera.width) != frame.shape:
-        intensity, depth = images.resize(
-            intensity, depth, camera.width, camera.height, config.max_depth_jump_m)
+    intensity, depth, camera = _resized(frame, camera, config)
     levels = [_level(intensity, depth, camera)]
     while len(levels) < config.levels and min(camera.width, camera.height) >= 2 * _SMALLEST_SIDE:
         intensity, depth = images.halve(intensity, depth, config.max_depth_jump_m)
@@ -48,11 +42,31 @@ def build(frame: RgbdFrame, camera: Camera, config: ImagesConfig) -> tuple[Level
     return tuple(levels)
 
 
+def at_working_size(frame: RgbdFrame, camera: Camera, config: ImagesConfig) -> tuple[RgbdFrame, Camera]:
+    """The frame, without its colours, and its camera as the finest level has them; raises as `build`."""
+    intensity, depth, camera = _resized(frame, camera, config)
+    return RgbdFrame(intensity, depth, frame.time_ns, frame.name), camera
+
+
 def working_camera(camera: Camera, config: ImagesConfig) -> Camera:
     """The camera at the working size: `config.width` wide and as high in proportion, never enlarged."""
     if camera.width <= config.width:
         return camera
     return camera.scaled(config.width, max(round(camera.height * config.width / camera.width), 1))
+
+
+def _resized(
+    frame: RgbdFrame, camera: Camera, config: ImagesConfig
+) -> tuple[np.ndarray, np.ndarray, Camera]:
+    """Intensity and depth (H, W) float32 at the working size, and the camera of that size."""
+    if not frame.depth.any():
+        raise DataError(f"{frame.name}: no pixel has a depth; is this the right depth image?")
+    camera = working_camera(camera, config)
+    if (camera.height, camera.width) == frame.shape:
+        return frame.intensity, frame.depth, camera
+    smaller = images.resize(
+        frame.intensity, frame.depth, camera.width, camera.height, config.max_depth_jump_m)
+    return *smaller, camera
 
 
 def _halved(camera: Camera) -> Camera:
