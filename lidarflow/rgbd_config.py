@@ -22,8 +22,8 @@ class ImagesConfig:
 
 @dataclass(frozen=True, slots=True)
 class ClustersConfig:
-    count: int = setting(24, "N: geometric clusters of K-Means", low=1, high=200)
-    max_rounds: int = setting(9, "rounds of K-Means at most", low=1)
+    count: int = setting(40, "N: geometric clusters of K-Means; 24 in the paper", low=1, high=200)
+    max_rounds: int = setting(20, "rounds of K-Means at most", low=1)
     tolerance_m: float = setting(0.01, "K-Means stops when no centre moves farther", low=0)
     touching_m: float = setting(
         0.015, "clusters touch where neighbouring pixels of a 320 wide image are this near; in proportion at "
@@ -52,7 +52,9 @@ class AlignmentConfig:
 
 @dataclass(frozen=True, slots=True)
 class RobustConfig:
-    cauchy_scale: float = setting(0.25, "c of the Cauchy loss in mean absolute residuals", low=1e-3)
+    depth_power: float = setting(
+        2.0, "pixels weigh their depth to this power: what is far moves less often; 1 in the paper", low=0)
+    cauchy_scale: float = setting(0.5, "c of the Cauchy loss in mean absolute residuals", low=1e-3)
     max_warps: int = setting(3, "warps per pyramid level at most", low=1)
     small_step: float = setting(
         0.04, "no further warp after a twist (metres, radians) whose norm is below this", low=0)
@@ -61,7 +63,9 @@ class RobustConfig:
 @dataclass(frozen=True, slots=True)
 class SegmentationConfig:
     enabled: bool = setting(True, "off = plain robust odometry, everything static")
-    min_threshold: float = setting(0.007, "the base threshold t is never lower", low=0)
+    quantile: float = setting(
+        0.25, "the base threshold t is this quantile of the clusters' residuals", low=0, high=1)
+    min_threshold: float = setting(0.007, "but never lower than this", low=0)
     max_threshold: float = setting(0.015, "nor higher than this times (1 + 10 ‖ξ‖)", low=0)
     threshold_per_motion: float = setting(
         10.0, "how the thresholds grow with the norm of the odometry's twist (metres, radians)", low=0)
@@ -85,11 +89,16 @@ class SegmentationConfig:
 
 @dataclass(frozen=True, slots=True)
 class RefinementConfig:
+    doubt_power: float = setting(
+        4.0, "odometry pixels weigh 1 − b to this power; ½ in the authors' program", low=0)
     depth_noise: float = setting(5e-5, "K_Z in the pre-weights of depth residuals, m²", low=1e-12)
-    intensity_noise: float = setting(0.1, "K_I in the pre-weights of intensity residuals", low=1e-12)
+    intensity_noise: float = setting(0.01, "K_I in the pre-weights of intensity residuals", low=1e-12)
     odometry_cauchy_scale: float = setting(2.0, "c for the odometry in mean absolute residuals", low=1e-3)
     cluster_cauchy_scale: float = setting(1.0, "c for a moving cluster in mean absolute residuals", low=1e-3)
     warps: int = setting(1, "warps per pyramid level", low=1)
+    max_rounds: int = setting(
+        2, "refined this often at most, while segmenting again changes which clusters are static or move",
+        low=1)
 
 
 @dataclass(frozen=True, slots=True)

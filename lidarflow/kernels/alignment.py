@@ -22,10 +22,11 @@ _VECTORISED = {"fastmath": {"reassoc", "nsz", "arcp", "contract"}, "error_model"
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def look_up(target, u, v, max_jump_m, seen):
-    """Fill `seen` (6,) with the packed image at (u, v); False outside it or next to a hole in depth.
+def look_up(target, u, v, max_jump_m, layers, seen):
+    """Fill `seen` with the first `layers` of a packed image at (u, v); False if it has no depth there.
 
-    Bilinear, but the nearest pixel alone where the four depths around differ by more than `max_jump_m`.
+    That is outside the image, or where one of the four pixels around has none. Bilinear, but the nearest
+    pixel alone where the four depths differ by more than `max_jump_m`.
     """
     rows, columns = target.shape[0], target.shape[1]
     if not (u >= 0.0 and v >= 0.0 and u <= columns - 1 and v <= rows - 1):
@@ -40,13 +41,13 @@ def look_up(target, u, v, max_jump_m, seen):
     if farthest - nearest > max_jump_m:
         i = left + (1 if share_u >= 0.5 else 0)
         j = top + (1 if share_v >= 0.5 else 0)
-        for k in range(6):
+        for k in range(layers):
             seen[k] = target[j, i, k]
         return True
     one = np.float32(1.0)
     w00, w01 = (one - share_u) * (one - share_v), share_u * (one - share_v)
     w10, w11 = (one - share_u) * share_v, share_u * share_v
-    for k in range(6):
+    for k in range(layers):
         seen[k] = (w00 * target[top, left, k] + w01 * target[top, left + 1, k]
                    + w10 * target[top + 1, left, k] + w11 * target[top + 1, left + 1, k])
     return True
@@ -76,7 +77,7 @@ def _equations_of(source, target, v, u, camera, motion, prior, noise, weighting,
     if z <= NEAREST_M:
         return False, np.float32(0.0), np.float32(0.0)
     by_z = np.float32(1.0) / z
-    if not look_up(target, fx * x * by_z + cx, fy * y * by_z + cy, max_jump_m, seen):
+    if not look_up(target, fx * x * by_z + cx, fy * y * by_z + cy, max_jump_m, 6, seen):
         return False, np.float32(0.0), np.float32(0.0)
     half = np.float32(0.5)
     r_intensity, r_depth = seen[0] - source[v, u, 0], seen[1] - z
@@ -221,40 +222,61 @@ def _next_twist(sums, damping, twist):
     return change
 
 
-def _irls(system, count, scales, cauchy_scale, max_rounds, min_gain, min_step, damping):
+@numba.njit(cache=True)
+def _chunk_sums(system, chunk, chunks, scales, twist, cauchy, sums):
+    """Add what one chunk of columns gives to `sums`, absolute residuals to the first if `cauchy` is 0."""
+    half = system.shape[1] // 2
+    kind, number = chunk // chunks, chunk % chunks
+    start, end = kind * half + number * _CHUNK, kind * half + min((number + 1) * _CHUNK, half)
+    if cauchy == 0.0:
+        sums[0] += _absolute_sum(system, start, end, scales[kind], twist)
+    else:
+        _normal_equations(system, start, end, scales[kind], twist, cauchy * cauchy, sums)
+
+
+@numba.njit(cache=True, parallel=True)
+def _sums(system, scales, twist, cauchy):
+    chunks = (system.shape[1] // 2 + _CHUNK - 1) // _CHUNK
+    partial = np.zeros((2 * chunks, _SUMS))
+    for chunk in numba.prange(2 * chunks):
+        _chunk_sums(system, chunk, chunks, scales, twist, cauchy, partial[chunk])
+    total = np.zeros(_SUMS)
+    for chunk in range(2 * chunks):
+        total += partial[chunk]
+    return total
+
+
+@numba.njit(cache=True)
+def _sums_alone(system, scales, twist, cauchy):
+    """As `_sums`, by the calling thread."""
+    chunks = (system.shape[1] // 2 + _CHUNK - 1) // _CHUNK
+    total = np.zeros(_SUMS)
+    for chunk in range(2 * chunks):
+        _chunk_sums(system, chunk, chunks, scales, twist, cauchy, total)
+    return total
+
+
+@numba.njit(cache=True)
+def solve(system, count, scales, cauchy_scale, max_rounds, min_gain, min_step, damping, alone):
     """Twist (6,) that minimises Σ F(r + J ξ) over the equations, F the Cauchy loss (eq. 6), by IRLS.
 
     Its scale c is `cauchy_scale` mean absolute residuals, renewed every round. `count` pixels have
-    equations; `scales` (2,) multiply those of intensity and of depth.
+    equations; `scales` (2,) multiply those of intensity and of depth. With `alone` one thread does it all.
     """
     twist = np.zeros(6)
-    half = system.shape[1] // 2
-    chunks = (half + _CHUNK - 1) // _CHUNK
     if count == 0:
         return twist
     last = np.inf
     for _ in range(max_rounds):
-        partial = np.zeros((2 * chunks, _SUMS))
-        for chunk in numba.prange(2 * chunks):
-            kind, number = chunk // chunks, chunk % chunks
-            start, end = kind * half + number * _CHUNK, kind * half + min((number + 1) * _CHUNK, half)
-            partial[chunk, 0] = _absolute_sum(system, start, end, scales[kind], twist)
-        cauchy = cauchy_scale * max(partial[:, 0].sum() / (2 * count), _SMALLEST_MEAN)
-        partial[:, 0] = 0.0
-        for chunk in numba.prange(2 * chunks):
-            kind, number = chunk // chunks, chunk % chunks
-            start, end = kind * half + number * _CHUNK, kind * half + min((number + 1) * _CHUNK, half)
-            _normal_equations(system, start, end, scales[kind], twist, cauchy * cauchy, partial[chunk])
-        sums = partial.sum(axis=0)
+        absolute = _sums_alone(system, scales, twist, 0.0) if alone else _sums(system, scales, twist, 0.0)
+        cauchy = cauchy_scale * max(absolute[0] / (2 * count), _SMALLEST_MEAN)
+        sums = (_sums_alone(system, scales, twist, cauchy) if alone
+                else _sums(system, scales, twist, cauchy))
         change = _next_twist(sums, damping, twist)
         if sums[_SUMS - 1] > (1.0 - min_gain) * last or change < min_step:
             break
         last = sums[_SUMS - 1]
     return twist
-
-
-solve = numba.njit(cache=True, parallel=True)(_irls)
-_solve_alone = numba.njit(cache=True)(_irls)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -267,9 +289,14 @@ def solve_each(source, target, camera, motions, pixels, starts, noise, max_jump_
     """
     columns = source.shape[1]
     twists = np.zeros((len(motions), 6))
-    for k in numba.prange(len(motions)):
+    systems = np.empty(14 * len(pixels), np.float32)
+    by_size = np.argsort(starts[:-1] - starts[1:])
+    order = np.concatenate((by_size[::2], by_size[1::2]))   # so that two threads have as much to do
+    for job in numba.prange(len(motions)):
+        k = order[job]
         size = starts[k + 1] - starts[k]
-        system = np.zeros((7, 2 * size), np.float32)
+        system = systems[14 * starts[k]:14 * starts[k + 1]].reshape(7, 2 * size)
+        system[:] = 0.0
         seen = np.empty(6, np.float32)
         count, best_intensity, best_depth = 0, np.float32(0.0), np.float32(0.0)
         for i in range(size):
@@ -282,6 +309,6 @@ def solve_each(source, target, camera, motions, pixels, starts, noise, max_jump_
                 best_intensity, best_depth = max(best_intensity, w_intensity), max(best_depth, w_depth)
         if count > 0:
             scales = np.array([photometric_weight / best_intensity, 1.0 / best_depth])
-            twists[k] = _solve_alone(
-                system, count, scales, cauchy_scale, max_rounds, min_gain, min_step, damping)
+            twists[k] = solve(
+                system, count, scales, cauchy_scale, max_rounds, min_gain, min_step, damping, True)
     return twists

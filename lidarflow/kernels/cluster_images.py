@@ -25,7 +25,7 @@ def residuals(source, target, camera, motion, label, count, max_jump_m, max_dept
     rows, columns = label.shape
     partial = np.zeros((rows, count, 4))
     for v in numba.prange(rows):
-        seen = np.empty(6, np.float32)
+        seen = np.empty(2, np.float32)
         for u in range(columns):
             k = label[v, u]
             if k < 0:
@@ -40,7 +40,7 @@ def residuals(source, target, camera, motion, label, count, max_jump_m, max_dept
                 continue
             x, y, z = moved(depth, v, u, camera, motion)
             there_u, there_v = camera[0] * x / z + camera[2], camera[1] * y / z + camera[3]
-            if z <= NEAREST_M or not look_up(target, there_u, there_v, max_jump_m, seen):
+            if z <= NEAREST_M or not look_up(target, there_u, there_v, max_jump_m, 2, seen):
                 continue
             hidden_m = z - seen[1]
             weight = min(max(2.0 - hidden_m / occlusion_m, 0.0), 1.0)
@@ -53,21 +53,39 @@ def residuals(source, target, camera, motion, label, count, max_jump_m, max_dept
     return total
 
 
+@numba.njit(cache=True)
+def _neighbours(touch):
+    """Clusters that touch each cluster, itself included: (K, K) int32 from the left, and how many (K,)."""
+    count = len(touch)
+    near, number = np.zeros((count, count), np.int32), np.zeros(count, np.int64)
+    for own in range(count):
+        for k in range(count):
+            if touch[own, k]:
+                near[own, number[own]] = k
+                number[own] += 1
+    return near, number
+
+
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _blending(x, y, z, own, centres, touch, per_m2, weights):
-    """Fill `weights` (K,), of sum 1, for a point of cluster `own`: exp(−per_m2 |d_own² − d_k²|) or 0."""
-    own_sq = ((x - centres[own, 0]) ** 2 + (y - centres[own, 1]) ** 2 + (z - centres[own, 2]) ** 2)
+def _blending(point, own, centres, near, per_m2, weights):
+    """Fill `weights`, of sum 1, of the clusters `near` that a point of cluster `own` may move with.
+
+    They are exp(−per_m2 |d_own² − d²|) with d the distances to the centres.
+    """
+    own_sq = _distance_sq(point, centres[own])
     total = np.float32(0.0)
-    for k in range(len(centres)):
-        weights[k] = 0.0
-        if touch[own, k]:
-            other_sq = ((x - centres[k, 0]) ** 2 + (y - centres[k, 1]) ** 2 + (z - centres[k, 2]) ** 2)
-            exponent = per_m2 * abs(own_sq - other_sq)
-            if exponent < _NEGLIGIBLE:
-                weights[k] = math.exp(-exponent)
-                total += weights[k]
-    for k in range(len(centres)):
-        weights[k] /= total
+    for i in range(len(near)):
+        exponent = per_m2 * abs(own_sq - _distance_sq(point, centres[near[i]]))
+        weights[i] = math.exp(-exponent) if exponent < _NEGLIGIBLE else np.float32(0.0)
+        total += weights[i]
+    for i in range(len(near)):
+        weights[i] /= total
+
+
+@numba.njit(cache=True, inline="always")
+def _distance_sq(a, b):
+    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return x * x + y * y + z * z
 
 
 @numba.njit(cache=True, parallel=True)
@@ -79,23 +97,21 @@ def members(points, label, centres, touch, per_m2, min_weight, wanted):
     """
     rows, columns = label.shape
     count = len(centres)
-    near = np.zeros(count, np.int64)   # how many wanted clusters a cluster's pixels may belong to
-    for own in range(count):
-        for k in range(count):
-            near[own] += wanted[k] and touch[own, k]
+    near, number = _neighbours(touch)
+    belongs = np.zeros((rows, columns, number.max()), np.bool_)
     per_row = np.zeros((rows, count), np.int64)
-    belongs = np.zeros((rows, columns, count), np.bool_)
     for v in numba.prange(rows):
         weights = np.empty(count, np.float32)
         for u in range(columns):
             own = label[v, u]
-            if own < 0 or near[own] == 0:
+            if own < 0:
                 continue
-            _blending(points[v, u, 0], points[v, u, 1], points[v, u, 2], own, centres, touch, per_m2, weights)
-            for k in range(count):
-                if wanted[k] and weights[k] > min_weight:
-                    belongs[v, u, k] = True
-                    per_row[v, k] += 1
+            around = near[own, :number[own]]
+            _blending(points[v, u], own, centres, around, per_m2, weights)
+            for i in range(len(around)):
+                if wanted[around[i]] and weights[i] > min_weight:
+                    belongs[v, u, i] = True
+                    per_row[v, around[i]] += 1
     starts = np.zeros(count + 1, np.int64)
     first = np.zeros((rows, count), np.int64)
     for k in range(count):
@@ -107,10 +123,11 @@ def members(points, label, centres, touch, per_m2, min_weight, wanted):
     for v in numba.prange(rows):
         for u in range(columns):
             own = label[v, u]
-            if own < 0 or near[own] == 0:
+            if own < 0:
                 continue
-            for k in range(count):
-                if belongs[v, u, k]:
+            for i in range(number[own]):
+                if belongs[v, u, i]:
+                    k = near[own, i]
                     pixels[first[v, k]] = v * columns + u
                     first[v, k] += 1
     return pixels, starts
@@ -120,6 +137,7 @@ def members(points, label, centres, touch, per_m2, min_weight, wanted):
 def blended_flow(points, label, centres, touch, per_m2, motions):
     """Flow (H, W, 3) float32 of points (H, W, 3) by the blended motions (K, 3, 4) of touching clusters."""
     rows, columns = label.shape
+    near, number = _neighbours(touch)
     flow = np.zeros((rows, columns, 3), np.float32)
     for v in numba.prange(rows):
         weights = np.empty(len(centres), np.float32)
@@ -127,12 +145,13 @@ def blended_flow(points, label, centres, touch, per_m2, motions):
             own = label[v, u]
             if own < 0:
                 continue
-            x, y, z = points[v, u, 0], points[v, u, 1], points[v, u, 2]
-            _blending(x, y, z, own, centres, touch, per_m2, weights)
-            for k in range(len(centres)):
-                if weights[k] > 0.0:
-                    for axis in range(3):
-                        there = (motions[k, axis, 0] * x + motions[k, axis, 1] * y + motions[k, axis, 2] * z
-                                 + motions[k, axis, 3])
-                        flow[v, u, axis] += weights[k] * (there - points[v, u, axis])
+            around = near[own, :number[own]]
+            point = points[v, u]
+            _blending(point, own, centres, around, per_m2, weights)
+            for i in range(len(around)):
+                motion = motions[around[i]]
+                for axis in range(3):
+                    there = (motion[axis, 0] * point[0] + motion[axis, 1] * point[1]
+                             + motion[axis, 2] * point[2] + motion[axis, 3])
+                    flow[v, u, axis] += weights[i] * (there - point[axis])
     return flow

@@ -7,41 +7,54 @@ nothing.
 import numba
 import numpy as np
 
-_CHUNK = 2048
+_CHUNK = 1024
 
 
 @numba.njit(cache=True, parallel=True)
 def nearest(points, centres):
-    """Index (N,) int32 of the centre (K, 3) nearest to each point (N, 3); −1 where z is 0."""
+    """Index (N,) int32 of the centre (K, 3) nearest to each point (N, 3); −1 where z is 0. All float32."""
     label = np.empty(len(points), np.int32)
     for chunk in numba.prange((len(points) + _CHUNK - 1) // _CHUNK):
-        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))):
-            label[i] = _nearest(points[i, 0], points[i, 1], points[i, 2], centres)
+        start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
+        _label_chunk(points[start:end], centres, label[start:end])
     return label
 
 
-@numba.njit(cache=True, inline="always")
-def _nearest(x, y, z, centres):
-    best, best_sq = -1, np.float32(np.inf)
-    if z > 0.0:
-        for k in range(len(centres)):
-            dx, dy, dz = x - centres[k, 0], y - centres[k, 1], z - centres[k, 2]
-            distance_sq = dx * dx + dy * dy + dz * dz
-            if distance_sq < best_sq:
-                best, best_sq = k, distance_sq
-    return best
+@numba.njit(cache=True)
+def _label_chunk(points, centres, label):
+    """As `nearest`, for so few points that everything stays in the nearest cache."""
+    count = len(points)
+    x, y, z = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.float32)
+    smallest_sq = np.full(count, np.inf, np.float32)
+    for i in range(count):
+        x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
+        label[i] = -1
+    for k in range(len(centres)):
+        cx, cy, cz = centres[k, 0], centres[k, 1], centres[k, 2]
+        for i in range(count):   # without branches, so that it uses vector registers
+            distance_sq = (x[i] - cx) * (x[i] - cx) + (y[i] - cy) * (y[i] - cy) + (z[i] - cz) * (z[i] - cz)
+            closer = distance_sq < smallest_sq[i]
+            smallest_sq[i] = distance_sq if closer else smallest_sq[i]
+            label[i] = k if closer else label[i]
+    for i in range(count):
+        if z[i] <= 0.0:
+            label[i] = -1
 
 
 @numba.njit(cache=True, parallel=True)
 def _sums(points, centres):
+    """Sums (K, 4) of the coordinates of the points nearest to each centre, and their number."""
     chunks = (len(points) + _CHUNK - 1) // _CHUNK
     partial = np.zeros((chunks, len(centres), 4))
     for chunk in numba.prange(chunks):
-        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))):
-            k = _nearest(points[i, 0], points[i, 1], points[i, 2], centres)
+        start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
+        label = np.empty(end - start, np.int32)
+        _label_chunk(points[start:end], centres, label)
+        for i in range(end - start):
+            k = label[i]
             if k >= 0:
                 for axis in range(3):
-                    partial[chunk, k, axis] += points[i, axis]
+                    partial[chunk, k, axis] += points[start + i, axis]
                 partial[chunk, k, 3] += 1.0
     total = np.zeros((len(centres), 4))
     for chunk in range(chunks):

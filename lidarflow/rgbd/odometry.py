@@ -9,6 +9,7 @@ from lidarflow.rgbd.pyramid import Level
 from lidarflow.rgbd_config import AlignmentConfig, RgbdConfig
 
 _NO_NOISE_MODEL = np.ones(2, np.float32)
+_WORTH_SHARING = 40_000   # equations: for fewer, waking a second thread takes longer than the sums
 
 
 def robust(
@@ -20,9 +21,9 @@ def robust(
     Pixels weigh Z1 (1 − B^T), with `b_before` (K,) the previous pair's segmentation in this pair's clusters.
     """
     static = np.append(np.clip(1.0 - b_before, 0.0, 1.0), 0.0).astype(np.float32)
-    motion = np.eye(4)
+    motion, power = np.eye(4), np.float32(config.robust.depth_power)
     for level in reversed(range(len(source))):
-        weight = source[level].points[..., 2] * static[clusters.labels[level]]
+        weight = source[level].points[..., 2] ** power * static[clusters.labels[level]]
         for _ in range(config.robust.max_warps):
             system = alignment.linearise(
                 source[level].packed, target[level].packed, source[level].intrinsics, rows34(motion), weight,
@@ -46,4 +47,4 @@ def solve(
     scales = np.array([config.photometric_weight, 1.0]) / np.maximum(largest_weights, 1e-12)
     return alignment.solve(
         system, count, scales, cauchy_scale, config.max_irls_rounds, config.min_gain, config.min_step,
-        config.damping)
+        config.damping, system.shape[1] < _WORTH_SHARING)

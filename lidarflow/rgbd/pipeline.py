@@ -58,12 +58,19 @@ def _estimate(
     with timed("robust odometry"):
         b_or_static = np.zeros(len(clusters.centres)) if b_before is None else b_before
         robust = odometry.robust(source, target, clusters, b_or_static, config)
-    with timed("segmentation"):
-        b = segmentation.segment(source[0], target[0], clusters, robust, b_before, config)
-    with timed("refinement"):
-        static, motions = refinement.refine(source, target, clusters, b, config)
-    with timed("segmentation"):
-        b = segmentation.segment(source[0], target[0], clusters, static, b_before, config)
+    if config.segmentation.enabled:
+        with timed("segmentation"):
+            b = segmentation.segment(source[0], target[0], clusters, robust, b_before, config)
+        for _ in range(config.refinement.max_rounds):
+            before = b
+            with timed("refinement"):
+                static, motions = refinement.refine(source, target, clusters, b, config)
+            with timed("segmentation"):
+                b = segmentation.segment(source[0], target[0], clusters, static, b_before, config)
+            if not segmentation.class_changes(before, b, config.segmentation):
+                break
+    else:
+        b, static, motions = b_or_static, robust, np.tile(robust, (len(b_or_static), 1, 1))
     with timed("scene flow"):
         label = clusters.labels[0]
         flow = cluster_images.blended_flow(

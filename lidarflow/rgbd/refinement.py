@@ -21,7 +21,8 @@ def refine(
     """
     limits = config.segmentation
     own_motion, helps_odometry = b >= limits.static_below, b <= limits.moving_above
-    static = np.append(np.sqrt(np.clip(1.0 - b, 0.0, 1.0)) * helps_odometry, 0.0).astype(np.float32)
+    static = np.clip(1.0 - b, 0.0, 1.0) ** config.refinement.doubt_power * helps_odometry
+    static = np.append(static, 0.0).astype(np.float32)
     odometry, motions = np.eye(4), None
     for level in reversed(range(len(source))):
         for _ in range(config.refinement.warps):

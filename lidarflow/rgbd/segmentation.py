@@ -38,7 +38,8 @@ def mean_residuals(
 def thresholds(delta: np.ndarray, twist_norm: float, config: SegmentationConfig) -> tuple[float, float]:
     """δ_L and δ_H: residuals below the first speak for static, above the second for moving (eq. 22)."""
     growth = config.threshold_per_motion * twist_norm
-    base = max(config.min_threshold, min(config.max_threshold * (1.0 + growth), float(np.median(delta))))
+    typical = float(np.quantile(delta, config.quantile))
+    base = max(config.min_threshold, min(config.max_threshold * (1.0 + growth), typical))
     return (1.0 + growth) * base, (2.0 + growth) * base
 
 
@@ -66,3 +67,10 @@ def minimise(
         matrix += config.temporal * np.eye(len(z))
         right += config.temporal * b_before
     return np.linalg.solve(matrix, right)
+
+
+def class_changes(before: np.ndarray, after: np.ndarray, config: SegmentationConfig) -> bool:
+    """Whether any cluster passes between static, unsure and moving from one b (K,) to the other."""
+    own_motion = (before >= config.static_below) != (after >= config.static_below)
+    moving = (before > config.moving_above) != (after > config.moving_above)
+    return bool((own_motion | moving).any())
