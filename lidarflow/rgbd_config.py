@@ -22,7 +22,7 @@ class ImagesConfig:
 
 @dataclass(frozen=True, slots=True)
 class ClustersConfig:
-    count: int = setting(40, "N: geometric clusters of K-Means; 24 in the paper", low=1, high=200)
+    count: int = setting(48, "N: geometric clusters of K-Means; 24 in the paper", low=1, high=200)
     max_rounds: int = setting(20, "rounds of K-Means at most", low=1)
     tolerance_m: float = setting(0.01, "K-Means stops when no centre moves farther", low=0)
     touching_m: float = setting(
@@ -96,6 +96,9 @@ class RefinementConfig:
     odometry_cauchy_scale: float = setting(2.0, "c for the odometry in mean absolute residuals", low=1e-3)
     cluster_cauchy_scale: float = setting(1.0, "c for a moving cluster in mean absolute residuals", low=1e-3)
     warps: int = setting(1, "warps per pyramid level", low=1)
+    max_misfit_ratio: float = setting(
+        0.7, "a cluster takes the motion of one it touches where its misfit sinks to this share; 0 = never",
+        low=0, high=1)
     max_rounds: int = setting(
         2, "refined this often at most, while segmenting again changes which clusters are static or move",
         low=1)

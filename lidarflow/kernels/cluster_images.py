@@ -1,6 +1,6 @@
 """Images seen through clusters: residuals of each, soft membership, and blended motion.
 
-Packed images are those of images.py; `camera` (4,) is fx, fy, cx, cy; a motion is (3, 4), all float32.
+Packed images, points, cameras and motions are those of alignment.py.
 """
 
 import math
@@ -8,13 +8,13 @@ import math
 import numba
 import numpy as np
 
-from lidarflow.kernels.alignment import NEAREST_M, look_up, moved
+from lidarflow.kernels.alignment import look_up, moved
 
 _NEGLIGIBLE = 6.0   # exp(−6) = 0.0025: weights below it are 0
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def residuals(source, target, camera, motion, label, count, max_jump_m, max_depth_m, max_intensity,
+def residuals(points, source, target, camera, motion, label, count, max_jump_m, max_depth_m, max_intensity,
               occlusion_m, max_edge_m):
     """Sums (K, 4) over the pixels of each cluster: |r_I|, |r_Z|, their weight, and the number of pixels.
 
@@ -38,9 +38,8 @@ def residuals(source, target, camera, motion, label, count, max_jump_m, max_dept
                     + abs(source[v, u - 1, 1] - depth) + abs(source[v, u + 1, 1] - depth))
             if edge > max_edge_m:
                 continue
-            x, y, z = moved(depth, v, u, camera, motion)
-            there_u, there_v = camera[0] * x / z + camera[2], camera[1] * y / z + camera[3]
-            if z <= NEAREST_M or not look_up(target, there_u, there_v, max_jump_m, 2, seen):
+            x, y, z = moved(points[v, u], motion)
+            if not look_up(target, camera, x, y, z, max_jump_m, 2, seen):
                 continue
             hidden_m = z - seen[1]
             weight = min(max(2.0 - hidden_m / occlusion_m, 0.0), 1.0)
@@ -51,6 +50,35 @@ def residuals(source, target, camera, motion, label, count, max_jump_m, max_dept
     for v in range(rows):
         total += partial[v]
     return total
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def misfits(points, source, target, camera, pixels, starts, motions, tried, max_jump_m, photometric_weight,
+            max_intensity, max_depth_m):
+    """Mean α |r_I| + |r_Z| (K, K) of set k's pixels after motion j, where tried[k, j]; infinite elsewhere.
+
+    Sets of pixels are those of `members`, motions (K, 3, 4). Residuals are cut off at `max_intensity` and
+    `max_depth_m`, which is also what a pixel counts that is not seen again.
+    """
+    count = len(motions)
+    points, source = points.reshape(-1, 3), source.reshape(-1, 6)
+    mean = np.full((count, count), np.inf)
+    for job in numba.prange(count * count):
+        k, j = job // count, job % count
+        size = starts[k + 1] - starts[k]
+        if not tried[k, j] or size == 0:
+            continue
+        seen = np.empty(2, np.float32)
+        total = 0.0
+        for pixel in pixels[starts[k]:starts[k + 1]]:
+            x, y, z = moved(points[pixel], motions[j])
+            if look_up(target, camera, x, y, z, max_jump_m, 2, seen):
+                total += (photometric_weight * min(abs(seen[0] - source[pixel, 0]), max_intensity)
+                          + min(abs(seen[1] - z), max_depth_m))
+            else:
+                total += photometric_weight * max_intensity + max_depth_m
+        mean[k, j] = total / size
+    return mean
 
 
 @numba.njit(cache=True)
@@ -98,13 +126,17 @@ def members(points, label, centres, touch, per_m2, min_weight, wanted):
     rows, columns = label.shape
     count = len(centres)
     near, number = _neighbours(touch)
+    useful = np.zeros(count, np.bool_)
+    for own in range(count):
+        for k in near[own, :number[own]]:
+            useful[own] |= wanted[k]
     belongs = np.zeros((rows, columns, number.max()), np.bool_)
     per_row = np.zeros((rows, count), np.int64)
     for v in numba.prange(rows):
         weights = np.empty(count, np.float32)
         for u in range(columns):
             own = label[v, u]
-            if own < 0:
+            if own < 0 or not useful[own]:
                 continue
             around = near[own, :number[own]]
             _blending(points[v, u], own, centres, around, per_m2, weights)
@@ -123,7 +155,7 @@ def members(points, label, centres, touch, per_m2, min_weight, wanted):
     for v in numba.prange(rows):
         for u in range(columns):
             own = label[v, u]
-            if own < 0:
+            if own < 0 or not useful[own]:
                 continue
             for i in range(number[own]):
                 if belongs[v, u, i]:

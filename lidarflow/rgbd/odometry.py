@@ -9,7 +9,7 @@ from lidarflow.rgbd.pyramid import Level
 from lidarflow.rgbd_config import AlignmentConfig, RgbdConfig
 
 _NO_NOISE_MODEL = np.ones(2, np.float32)
-_WORTH_SHARING = 40_000   # equations: for fewer, waking a second thread takes longer than the sums
+_WORTH_SHARING = 300_000   # numbers in a system: for fewer, waking a second thread takes longer than the sums
 
 
 def robust(
@@ -25,10 +25,8 @@ def robust(
     for level in reversed(range(len(source))):
         weight = source[level].points[..., 2] ** power * static[clusters.labels[level]]
         for _ in range(config.robust.max_warps):
-            system = alignment.linearise(
-                source[level].packed, target[level].packed, source[level].intrinsics, rows34(motion), weight,
-                _NO_NOISE_MODEL, np.float32(0.0), np.float32(config.alignment.max_jump_m))
-            twist = solve(*system, config.robust.cauchy_scale, config.alignment)
+            twist = step(source[level], target[level], motion, weight, _NO_NOISE_MODEL, 0.0,
+                         config.robust.cauchy_scale, config.alignment)
             motion = pose.exp(twist) @ motion
             if np.linalg.norm(twist) < config.robust.small_step:
                 break
@@ -40,11 +38,19 @@ def rows34(motion: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(motion[..., :3, :], np.float32)
 
 
-def solve(
-    system: np.ndarray, count: int, largest_weights: np.ndarray, cauchy_scale: float, config: AlignmentConfig
+def step(
+    source: Level, target: Level, motion: np.ndarray, weight: np.ndarray, noise: np.ndarray, weighting: float,
+    cauchy_scale: float, config: AlignmentConfig,
 ) -> np.ndarray:
-    """Twist (6,) of the equations that `alignment.linearise` made; weights are divided by the largest."""
+    """Twist (6,) that improves a motion (4, 4) of all pixels of a `weight` (H, W) over 0, after one warp.
+
+    `noise` and `weighting` are those of `alignment.linearise`; its weights are divided by the largest.
+    """
+    pixels = np.flatnonzero(weight)
+    system, counts, largest_weights = alignment.linearise(
+        source.points, source.packed, target.packed, source.intrinsics, rows34(motion), pixels,
+        weight.ravel()[pixels], noise, np.float32(weighting), np.float32(config.max_jump_m))
     scales = np.array([config.photometric_weight, 1.0]) / np.maximum(largest_weights, 1e-12)
     return alignment.solve(
-        system, count, scales, cauchy_scale, config.max_irls_rounds, config.min_gain, config.min_step,
-        config.damping, system.shape[1] < _WORTH_SHARING)
+        system, counts, scales, cauchy_scale, config.max_irls_rounds, config.min_gain, config.min_step,
+        config.damping, system.size < _WORTH_SHARING)

@@ -26,7 +26,7 @@ def mean_residuals(
     """δ (K,): α_I mean |r_I| + mean |r_Z| / Z̄ of each cluster after the warp by `odometry` (eq. 8)."""
     limits = config.segmentation
     sums = cluster_images.residuals(
-        source.packed, target.packed, source.intrinsics, rows34(odometry), clusters.labels[0],
+        source.points, source.packed, target.packed, source.intrinsics, rows34(odometry), clusters.labels[0],
         len(clusters.centres), np.float32(config.alignment.max_jump_m),
         np.float32(limits.max_depth_residual_m), np.float32(limits.max_intensity_residual),
         np.float32(limits.occlusion_m), np.float32(limits.max_edge_m))
