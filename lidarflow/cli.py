@@ -11,6 +11,11 @@ import typer
 
 from lidarflow import __version__
 from lidarflow.errors import LidarflowError
+from lidarflow.rgbd_cli import app as rgbd_app
+from lidarflow.terminal import check_live_view as _check_live_view
+from lidarflow.terminal import progress as _progress
+from lidarflow.terminal import show as _print
+from lidarflow.terminal import working as _working
 
 if TYPE_CHECKING:
     from lidarflow.config import Config
@@ -22,6 +27,7 @@ _INTERRUPTED = 130     # what typer makes of Ctrl-C
 app = typer.Typer(
     help="Dense rigid scene flow: a rigid motion for every LiDAR point between consecutive scans.",
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app.add_typer(rgbd_app, name="rgbd")
 
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="TOML file with differences from the defaults.")]
@@ -147,7 +153,7 @@ def view(
     import shutil
     import tempfile
 
-    from lidarflow import io, viewer
+    from lidarflow import io, rgbd_io, viewer
 
     if save is not None:
         io.check_output("--save", save, ".rrd", inputs=(what,))
@@ -163,7 +169,7 @@ def view(
         _record_flow_file(what, target, save)
         print(f"recording  {save}")
     else:
-        io.load_flow(what)
+        rgbd_io.load_flow(what) if rgbd_io.is_rgbd_flow(what) else io.load_flow(what)
         viewer.require_display(f"make a recording with: lidarflow view {what} --save FILE.rrd")
         with tempfile.TemporaryDirectory() as folder:
             recording = Path(folder) / "flow.rrd"
@@ -203,21 +209,15 @@ def show_config() -> None:
 def _process(
     dataset: "Dataset", settings: "Config", out: Path, viewing: "Viewing", jump: int, n_scans: int | None
 ) -> None:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from lidarflow import runner
     from lidarflow.tables import run_notes, run_table
 
     _check_live_view(viewing.visualize)
     frames = runner.choose_frames(dataset, jump, n_scans)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
-               TimeElapsedColumn())
-    console = _console(sys.stderr)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("scan pairs", total=len(frames) - 1)
+    with _progress("scan pairs", len(frames) - 1) as progress:
 
         def on_pair(report: "PairReport") -> None:
-            progress.update(task, advance=1, description=f"scan pairs, {report.frame} done")
+            progress.update(0, advance=1, description=f"scan pairs, {report.frame} done")
 
         reports = runner.process(dataset, frames, settings, out, viewing, on_pair)
     print()
@@ -250,8 +250,11 @@ def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None
 
 
 def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
-    from lidarflow import datasets, io, viewer
+    from lidarflow import datasets, io, rgbd_io, viewer
 
+    if rgbd_io.is_rgbd_flow(file):
+        _record_rgbd_file(file, target, recording)
+        return
     found = io.load_flow(file)
     correction = found.config.get("preparation", {}).get("kitti_correction", "auto")
     points = None if target is None else datasets.read_scan(target, correction).points
@@ -261,27 +264,14 @@ def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
         viewer.close(stream)
 
 
-def _check_live_view(wanted: bool) -> None:
-    """InstallError before any work where a viewer is wanted and none can be opened."""
-    if wanted:
-        from lidarflow import viewer
+def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:
+    from lidarflow import io, rgbd_io, rgbd_viewer, viewer
+    from lidarflow.errors import DataError
 
-        viewer.require_live_view()
-
-
-def _working(what: str):
-    """A spinner on standard error while something long goes on."""
-    from rich.text import Text
-
-    return _console(sys.stderr).status(Text(what))
-
-
-def _console(file):
-    from rich.console import Console
-
-    # Names of files are shown as they are, not taken for markup or emoji.
-    return Console(file=file, markup=False, emoji=False, highlight=False)
-
-
-def _print(table) -> None:
-    _console(sys.stdout).print(table)
+    if target is not None:
+        raise DataError(f"--target {target}: {file} is of RGB-D images, which need no target to be shown")
+    found = rgbd_io.load_flow(file)
+    with io.written_aside(recording) as aside:
+        stream = rgbd_viewer.open_recording(aside)
+        rgbd_viewer.log_file(stream, found)
+        viewer.close(stream)

@@ -81,9 +81,14 @@ METHODS = {OURS: RgbdEstimator, "open3d": Open3dOdometry}
 
 def estimator(name: str, camera: Camera, config: RgbdConfig) -> Estimator:
     """A fresh estimator of one of METHODS; DataError for an unknown name."""
+    check(name)
+    return METHODS[name](camera, config)
+
+
+def check(name: str) -> None:
+    """Raise DataError unless `name` is one of METHODS."""
     if name not in METHODS:
         raise DataError(f"--method {name}: unknown; expected one of {', '.join(METHODS)}")
-    return METHODS[name](camera, config)
 
 
 def estimate_flow(name: str, pair: RgbdPair, config: RgbdConfig) -> RgbdResult:

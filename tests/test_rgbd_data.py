@@ -207,7 +207,7 @@ def test_poses_are_interpolated_between_neighbours_and_unknown_elsewhere():
 def test_a_written_folder_reads_back(folder):
     found = open_rgbd(folder)
     assert len(found) == 4 and found.layout == "tum" and found.name == "tum room"
-    assert found.camera == QVGA and "camera.toml" in found.note and "pixel/5000" in found.note
+    assert found.camera == QVGA and "camera.toml" in str(found.notes) and "pixel/5000" in str(found.notes)
     for k, (frame, truth) in enumerate(frames()):
         read = found.frame(k)
         np.testing.assert_array_equal(read.color, frame.color)
@@ -228,7 +228,7 @@ def test_images_that_are_listed_but_missing_are_passed_over(folder, tmp_path):
         with (place / f"{kind}.txt").open("a") as file:
             file.write(f"7.000000 {kind}/7.000000.png\n8.000000 {kind}/8.000000.png\n")
     found = open_rgbd(place)
-    assert len(found) == 4 and "2 of 6 images in rgb.txt are missing" in found.note
+    assert len(found) == 4 and "2 of 6 images in rgb.txt are missing" in str(found.notes)
 
 
 def test_depth_that_is_late_is_found_and_colour_without_depth_is_left_out(folder, tmp_path):
@@ -237,7 +237,7 @@ def test_depth_that_is_late_is_found_and_colour_without_depth_is_left_out(folder
     late = "".join(f"{float(stamp) + 0.012:.6f} {name}\n" for stamp, name in rows[:1] + rows[2:])
     (place / "depth.txt").write_text(late)
     found = open_rgbd(place)
-    assert len(found) == 3 and "1 of 4 colour images have no depth within 20 ms" in found.note
+    assert len(found) == 3 and "1 of 4 colour images have no depth within 20 ms" in str(found.notes)
     assert [found.frame(k).name for k in range(3)] == ["0.000000", "0.066667", "0.100000"]
     np.testing.assert_allclose(found.frame(1).depth, frames()[2][0].depth, atol=1.01e-4)
 
@@ -293,14 +293,14 @@ def test_color_and_depth_folders_as_open3d_has_them(tmp_path):
                   for k, motion in enumerate(poses))
     (tmp_path / "trajectory.log").write_text(log)
     found = open_rgbd(tmp_path)
-    assert len(found) == 3 and "pixel/1000" in found.note and "30 frames a second" in found.note
+    assert len(found) == 3 and "pixel/1000" in str(found.notes) and "30 frames a second" in str(found.notes)
     np.testing.assert_allclose(found.frame(2).depth, frames()[2][0].depth, atol=1.1e-3)
     np.testing.assert_allclose(found.world_from_camera(), poses, atol=1e-10)
     np.testing.assert_allclose(open_rgbd(tmp_path, depth_scale=500.0).frame(0).depth,
                                2.0 * found.frame(0).depth, rtol=1e-6)
     (tmp_path / "trajectory.log").write_text(log + "9 9 10\n")
     found = open_rgbd(tmp_path)
-    assert found.world_from_camera() is None and "trajectory.log has 16 lines" in found.note
+    assert found.world_from_camera() is None and "trajectory.log has 16 lines" in str(found.notes)
     (tmp_path / "trajectory.log").write_text(log.replace(".", ".9"))
     with pytest.raises(DataError, match="rigid"):
         open_rgbd(tmp_path)
@@ -316,7 +316,7 @@ def test_numbered_images_in_one_folder(tmp_path):
     write_images(tmp_path, "color{}.png", "depth{}.png", scale=5000)
     (tmp_path / "colormap.png").touch()
     found = open_rgbd(tmp_path)
-    assert len(found) == 3 and "pixel/5000" in found.note and found.camera == QVGA
+    assert len(found) == 3 and "pixel/5000" in str(found.notes) and found.camera == QVGA
     np.testing.assert_allclose(found.frame(1).depth, frames()[1][0].depth, atol=2.1e-4)
     (tmp_path / "depth1.png").unlink()
     with pytest.raises(DataError, match="3 images named color<number> and 2 named depth<number>"):

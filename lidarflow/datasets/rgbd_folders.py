@@ -59,7 +59,7 @@ class RgbdFolder:
 
     name    what messages call it
     layout  "tum" or "images"
-    note    what was assumed while opening it
+    notes   what was assumed while opening it
     camera  Camera
     """
 
@@ -68,8 +68,8 @@ class RgbdFolder:
         self.layout, self.camera = listing.layout, camera
         self._folder, self._files = folder, listing
         self._poses, pose_notes = _poses(listing)
-        self.note = "; ".join([f"camera: {origin}", f"depth in metres is pixel/{listing.depth_scale:g}",
-                               *listing.notes, *pose_notes])
+        self.notes = (f"camera: {origin}", f"depth in metres is pixel/{listing.depth_scale:g}",
+                      *listing.notes, *pose_notes)
 
     def __len__(self) -> int:
         return len(self._files.color)
