@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from lidarflow.rgbd_runner import RgbdReport
 
 app = typer.Typer(
-    help="Odometry and scene flow from RGB-D images: what stands still, what moves, and how.",
+    help="Odometry and scene flow from RGB-D images.",
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 CameraFile = Annotated[Path | None, typer.Option(

@@ -92,7 +92,7 @@ def test_help_and_version_load_nothing_heavy():
 
 def test_help_names_every_command(lidarflow):
     out = lidarflow.ok("--help")
-    for name in ("pair", "run", "view", "demo", "config"):
+    for name in ("pair", "run", "view", "demo", "config", "rgbd"):
         assert f"\n  {name} " in out
         assert all(len(line) <= 80 for line in lidarflow.ok(name, "--help").splitlines())
     assert "..." not in out.split("Commands:")[1]
