@@ -47,7 +47,7 @@ class AlignmentConfig:
     min_step: float = setting(1e-6, "or when no part of the twist (metres, radians) changes by more", low=0)
     damping: float = setting(
         1e-4, "share of the normal equations' mean diagonal added to it, against motions that no pixel sees",
-        low=0)
+        low=1e-6)
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ class Level:
 def build(frame: RgbdFrame, camera: Camera, config: ImagesConfig) -> tuple[Level, ...]:
     """The levels of a frame, the finest, of the working size, first.
 
-    Raises DataError for a frame without any depth.
+    Raises DataError for a frame without any depth, or one that is too small.
     """
     intensity, depth, camera = _resized(frame, camera, config)
     levels = [_level(intensity, depth, camera)]
@@ -62,6 +62,9 @@ def _resized(
     if not frame.depth.any():
         raise DataError(f"{frame.name}: no pixel has a depth; is this the right depth image?")
     camera = working_camera(camera, config)
+    if min(camera.width, camera.height) < _SMALLEST_SIDE:
+        raise DataError(f"{frame.name}: {camera.width}x{camera.height} pixels are too few to work with; "
+                        f"expected at least {_SMALLEST_SIDE} either way")
     if (camera.height, camera.width) == frame.shape:
         return frame.intensity, frame.depth, camera
     smaller = images.resize(

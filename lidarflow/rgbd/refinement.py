@@ -37,7 +37,7 @@ def refine(
                 np.float32(config.clusters.blending_per_m2), config.clusters.min_membership, own_motion)
             for _ in range(config.refinement.warps):
                 motions = _cluster_steps(*images, members, motions, config) @ motions
-            if level > 0:
+            if level > 0 and config.refinement.max_misfit_ratio > 0:
                 motions = motions[_best_of_touching(*images, members, clusters.touch, motions, config)]
     return odometry, motions
 
@@ -59,7 +59,8 @@ def _cluster_steps(
     return pose.exp(alignment.solve_each(
         source.points, source.packed, target.packed, source.intrinsics, rows34(motions), *members,
         _noise(config), np.float32(limits.max_jump_m), limits.photometric_weight,
-        config.refinement.cluster_cauchy_scale, limits.max_irls_rounds, limits.min_gain, limits.min_step, limits.damping))
+        config.refinement.cluster_cauchy_scale, limits.max_irls_rounds, limits.min_gain, limits.min_step,
+        limits.damping))
 
 
 def _best_of_touching(
