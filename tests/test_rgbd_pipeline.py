@@ -6,11 +6,11 @@ import numba
 import numpy as np
 import pytest
 import rgbd_corner
-from PIL import Image
 from rgbd_worlds import HALF_FRAMES, QVGA, frames, moving_share
 from shared_data import ROOT, SHARED, needs_shared
 
-from lidarflow import config, pose, rgbd_metrics
+from lidarflow import config, pose, rgbd_methods, rgbd_metrics
+from lidarflow.datasets.rgbd_folders import open_rgbd
 from lidarflow.errors import DataError
 from lidarflow.rgbd import RgbdEstimator, estimate_flow
 from lidarflow.rgbd_config import RgbdConfig
@@ -164,16 +164,13 @@ def test_images_that_say_little_still_give_a_finite_answer(depth):
     assert np.abs(pose.log(result.odometry)).max() < 1e-6
 
 
-# ---- the paper's pairs ----------------------------------------------------------------------------------
+# ---- real images ----------------------------------------------------------------------------------
 
 @functools.cache
 def real(name: str) -> tuple[RgbdPair, RgbdResult]:
-    folder = SHARED / "rgbd_joint_vo_sf_pairs" / name
-    images = [RgbdFrame.from_color(
-        np.asarray(Image.open(folder / f"color{k}.png").convert("RGB")),
-        np.asarray(Image.open(folder / f"depth{k}.png")).astype(np.float32) / 5000, name=f"{name} {k}")
-        for k in (0, 1)]
-    pair = RgbdPair(*images, Camera.from_field_of_view(640, 480))
+    folder = open_rgbd(SHARED / "rgbd_joint_vo_sf_pairs" / name)
+    assert folder.camera == Camera.from_field_of_view(640, 480)
+    pair = RgbdPair(folder.frame(0), folder.frame(1), folder.camera)
     return pair, estimate_flow(pair)
 
 
@@ -194,3 +191,23 @@ def test_people_robot_and_arm_move_and_the_room_does_not(name):
         assert result.is_dynamic[where][result.valid[where]].mean() > 0.9
     for where in STILL[name]:
         assert (result.b_image[where][result.valid[where]] < 1 / 3).mean() > 0.97
+
+
+@needs_shared
+@pytest.mark.parametrize(("name", "most_m", "most_deg"), [
+    ("rgbd_tum_fr1_desk9", 0.003, 0.4),     # the poses' own clock is about 20 ms off, a third of a degree
+    ("rgbd_open3d5", 0.0008, 0.03),
+])
+def test_drift_over_real_images_is_small_and_below_open3d_s(name, most_m, most_deg):
+    folder = open_rgbd(SHARED / name)
+    drifts = {}
+    for method in ("ours", "open3d"):
+        estimator = rgbd_methods.estimator(method, folder.camera, DEFAULTS)
+        results = [estimator.step(folder.frame(index)) for index in range(len(folder))][1:]
+        poses = pose.trajectory(np.array([result.odometry for result in results]))
+        drifts[method] = rgbd_metrics.drift(poses, folder.world_from_camera(), np.arange(len(folder)))
+        if method == "ours":
+            assert max(result.is_dynamic.mean() for result in results) < 0.02
+    ours, theirs = drifts["ours"], drifts["open3d"]
+    assert ours.per_frame_m < min(most_m, theirs.per_frame_m)
+    assert ours.per_frame_deg < min(most_deg, theirs.per_frame_deg)
