@@ -22,7 +22,7 @@ class ImagesConfig:
 
 @dataclass(frozen=True, slots=True)
 class ClustersConfig:
-    count: int = setting(48, "N: geometric clusters of K-Means; 24 in the paper", low=1, high=200)
+    count: int = setting(64, "N: geometric clusters of K-Means; 24 in the paper", low=1, high=200)
     max_rounds: int = setting(20, "rounds of K-Means at most", low=1)
     tolerance_m: float = setting(0.01, "K-Means stops when no centre moves farther", low=0)
     touching_m: float = setting(
@@ -100,7 +100,7 @@ class RefinementConfig:
         0.7, "a cluster takes the motion of one it touches where its misfit sinks to this share; 0 = never",
         low=0, high=1)
     max_rounds: int = setting(
-        2, "refined this often at most, while segmenting again changes which clusters are static or move",
+        2, "refined this often at most, while segmenting again changes which clusters are static",
         low=1)
 
 

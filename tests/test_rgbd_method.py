@@ -201,9 +201,7 @@ def test_residuals_far_from_the_thresholds_decide_and_distance_speaks_for_static
     np.testing.assert_allclose(b[:3], [0.0, 0.5, 2.0], atol=1e-12)
     weight, far = np.hypot(7.0, 1.0), 0.15 * (np.exp(4.0) - np.exp(1.75))
     assert b[3] == pytest.approx(2.0 * weight / (weight + far)) and b[3] < 1.0
-    assert not segmentation.class_changes(b, b + 1e-6, loose)
-    assert segmentation.class_changes(b, np.array([0.0, 0.7, 2.0, 0.0]), loose)
-    assert segmentation.class_changes(b, np.array([0.4, 0.5, 2.0, 0.0]), loose)
+    assert segmentation.has_own_motion(b, loose).tolist() == [False, True, True, True]
 
 
 @pytest.mark.parametrize(("typical", "twist_norm", "expected"), [

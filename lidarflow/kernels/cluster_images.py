@@ -170,6 +170,10 @@ def blended_flow(points, label, centres, touch, per_m2, motions):
     """Flow (H, W, 3) float32 of points (H, W, 3) by the blended motions (K, 3, 4) of touching clusters."""
     rows, columns = label.shape
     near, number = _neighbours(touch)
+    together = np.ones(len(touch), np.bool_)   # clusters that move as all that they touch: nothing to blend
+    for own in range(len(touch)):
+        for k in near[own, :number[own]]:
+            together[own] &= (motions[k] == motions[own]).all()
     flow = np.zeros((rows, columns, 3), np.float32)
     for v in numba.prange(rows):
         weights = np.empty(len(centres), np.float32)
@@ -177,13 +181,20 @@ def blended_flow(points, label, centres, touch, per_m2, motions):
             own = label[v, u]
             if own < 0:
                 continue
-            around = near[own, :number[own]]
             point = points[v, u]
+            if together[own]:
+                _add_flow(point, motions[own], np.float32(1.0), flow[v, u])
+                continue
+            around = near[own, :number[own]]
             _blending(point, own, centres, around, per_m2, weights)
             for i in range(len(around)):
-                motion = motions[around[i]]
-                for axis in range(3):
-                    there = (motion[axis, 0] * point[0] + motion[axis, 1] * point[1]
-                             + motion[axis, 2] * point[2] + motion[axis, 3])
-                    flow[v, u, axis] += weights[i] * (there - point[axis])
+                _add_flow(point, motions[around[i]], weights[i], flow[v, u])
     return flow
+
+
+@numba.njit(cache=True, inline="always")
+def _add_flow(point, motion, weight, flow):
+    x, y, z = moved(point, motion)
+    flow[0] += weight * (x - point[0])
+    flow[1] += weight * (y - point[1])
+    flow[2] += weight * (z - point[2])

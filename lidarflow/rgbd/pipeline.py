@@ -67,7 +67,8 @@ def _estimate(
                 static, motions = refinement.refine(source, target, clusters, b, config)
             with timed("segmentation"):
                 b = segmentation.segment(source[0], target[0], clusters, static, b_before, config)
-            if not segmentation.class_changes(before, b, config.segmentation):
+            if (segmentation.has_own_motion(b, config.segmentation)
+                    == segmentation.has_own_motion(before, config.segmentation)).all():
                 break
     else:
         b, static, motions = b_or_static, robust, np.tile(robust, (len(b_or_static), 1, 1))

@@ -1,6 +1,7 @@
 """A frame at its working size and at every coarser level, with gradients."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -80,4 +81,11 @@ def _halved(camera: Camera) -> Camera:
 
 def _level(intensity: np.ndarray, depth: np.ndarray, camera: Camera) -> Level:
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-    return Level(camera, intrinsics, images.pack(intensity, depth), camera.points(depth))
+    points = _rays(camera) * depth[..., None]
+    return Level(camera, intrinsics, images.pack(intensity, depth), points)
+
+
+@lru_cache(maxsize=16)
+def _rays(camera: Camera) -> np.ndarray:
+    """Points (H, W, 3) float32 at depth 1."""
+    return camera.points(np.ones((camera.height, camera.width), np.float32))

@@ -7,6 +7,7 @@ from lidarflow.kernels import alignment, cluster_images
 from lidarflow.rgbd.clusters import Clusters
 from lidarflow.rgbd.odometry import rows34, step
 from lidarflow.rgbd.pyramid import Level
+from lidarflow.rgbd.segmentation import has_own_motion
 from lidarflow.rgbd_config import RgbdConfig
 
 
@@ -20,7 +21,7 @@ def refine(
     find it; those between do both. The coarsest level knows the odometry alone.
     """
     limits = config.segmentation
-    own_motion, helps_odometry = b >= limits.static_below, b <= limits.moving_above
+    own_motion, helps_odometry = has_own_motion(b, limits), b <= limits.moving_above
     static = np.clip(1.0 - b, 0.0, 1.0) ** config.refinement.doubt_power * helps_odometry
     static = np.append(static, 0.0).astype(np.float32)
     coarsest = len(source) - 1

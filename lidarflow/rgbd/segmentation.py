@@ -69,8 +69,6 @@ def minimise(
     return np.linalg.solve(matrix, right)
 
 
-def class_changes(before: np.ndarray, after: np.ndarray, config: SegmentationConfig) -> bool:
-    """Whether any cluster passes between static, unsure and moving from one b (K,) to the other."""
-    own_motion = (before >= config.static_below) != (after >= config.static_below)
-    moving = (before > config.moving_above) != (after > config.moving_above)
-    return bool((own_motion | moving).any())
+def has_own_motion(b: np.ndarray, config: SegmentationConfig) -> np.ndarray:
+    """The clusters (K,) bool of b (K,) that are not static for certain."""
+    return b >= config.static_below
