@@ -54,7 +54,8 @@ class AlignmentConfig:
 class RobustConfig:
     depth_power: float = setting(
         2.0, "pixels weigh their depth to this power: what is far moves less often; 1 in the paper", low=0)
-    cauchy_scale: float = setting(0.5, "c of the Cauchy loss in mean absolute residuals", low=1e-3)
+    cauchy_scale: float = setting(
+        0.5, "c of the Cauchy loss in mean absolute residuals; ¼ in the authors' program", low=1e-3)
     max_warps: int = setting(3, "warps per pyramid level at most", low=1)
     small_step: float = setting(
         0.04, "no further warp after a twist (metres, radians) whose norm is below this", low=0)
@@ -64,8 +65,9 @@ class RobustConfig:
 class SegmentationConfig:
     enabled: bool = setting(True, "off = plain robust odometry, everything static")
     quantile: float = setting(
-        0.25, "the base threshold t is this quantile of the clusters' residuals", low=0, high=1)
-    min_threshold: float = setting(0.007, "but never lower than this", low=0)
+        0.25, "the base threshold t is this quantile of the clusters' residuals; ½ in the authors' program",
+        low=0, high=1)
+    min_threshold: float = setting(0.007, "but never lower than this", low=1e-5)
     max_threshold: float = setting(0.015, "nor higher than this times (1 + 10 ‖ξ‖)", low=0)
     threshold_per_motion: float = setting(
         10.0, "how the thresholds grow with the norm of the odometry's twist (metres, radians)", low=0)
@@ -91,8 +93,10 @@ class SegmentationConfig:
 class RefinementConfig:
     doubt_power: float = setting(
         4.0, "odometry pixels weigh 1 − b to this power; ½ in the authors' program", low=0)
-    depth_noise: float = setting(5e-5, "K_Z in the pre-weights of depth residuals, m²", low=1e-12)
-    intensity_noise: float = setting(0.01, "K_I in the pre-weights of intensity residuals", low=1e-12)
+    depth_noise: float = setting(
+        5e-5, "K_Z in the pre-weights of depth residuals, m²; 1e-4 in the paper", low=1e-12)
+    intensity_noise: float = setting(
+        0.01, "K_I in the pre-weights of intensity residuals; 0.1 in the paper", low=1e-12)
     odometry_cauchy_scale: float = setting(2.0, "c for the odometry in mean absolute residuals", low=1e-3)
     cluster_cauchy_scale: float = setting(1.0, "c for a moving cluster in mean absolute residuals", low=1e-3)
     warps: int = setting(1, "warps per pyramid level", low=1)

@@ -94,7 +94,7 @@ class RgbdFrame:
     @classmethod
     def from_color(cls, color: np.ndarray, depth: np.ndarray, time_ns: int = 0,
                    name: str = "frame") -> "RgbdFrame":
-        """A frame of an RGB image (H, W, 3) uint8, whose luma is the intensity, and depth (H, W) in metres."""
+        """A frame of an RGB image (H, W, 3) uint8, whose luma is its intensity, and depth (H, W) [m]."""
         intensity = np.clip(color.astype(np.float32) / 255.0 @ _LUMA, 0.0, 1.0)
         return cls(intensity, depth, time_ns, name, color)
 
@@ -129,7 +129,7 @@ class RgbdResult:
     points           (H, W, 3) float32   metres, source camera frame
     valid            (H, W) bool         the source has depth there
     label            (H, W) int32        geometric cluster of each pixel, −1 = none
-    b                (K,) float64        0 = the cluster is static, 1 = it moves by itself
+    b                (K,) float64        0 = the cluster is static, 1 = it moves by itself, 2 = without doubt
     cluster_motions  (K, 4, 4) float64   target_from_source of what is not static in each cluster
     odometry         (4, 4) float64      target_from_source of the static world
     is_dynamic       (H, W) bool         pixels of clusters that move

@@ -77,6 +77,8 @@ def test_a_frame_that_says_nothing_is_refused():
     blank = RgbdFrame(np.ones((240, 320), np.float32), np.zeros((240, 320), np.float32), name="dark")
     with pytest.raises(DataError, match="dark: no pixel has a depth"):
         levels_of(blank)
+    with pytest.raises(DataError, match="corner: 320x240 pixels, but the camera has 640x480"):
+        levels_of(rgbd_corner.frame(np.eye(4)), Camera.from_field_of_view(640, 480))
     tiny = RgbdFrame(np.ones((4, 320), np.float32), np.ones((4, 320), np.float32), name="strip")
     with pytest.raises(DataError, match="strip: 320x4 pixels are too few"):
         levels_of(tiny, Camera.from_field_of_view(320, 4))

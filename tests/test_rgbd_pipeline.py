@@ -156,6 +156,7 @@ def test_an_estimator_carries_the_segmentation_and_forgets_after_a_frame_it_cann
 @pytest.mark.parametrize("depth", [
     pytest.param(np.eye(240, 320, dtype=np.float32), id="hardly any depth"),
     pytest.param(np.full((240, 320), 2.0, np.float32), id="nothing to see on a wall"),
+    pytest.param(np.linspace(900, 5e4, 240 * 320, dtype=np.float32).reshape(240, 320), id="millimetres"),
 ])
 def test_images_that_say_little_still_give_a_finite_answer(depth):
     frame = RgbdFrame(np.full((240, 320), 0.5, np.float32), depth)

@@ -119,8 +119,8 @@ def _write(equations, column, weight, ax, ay, az, x, y, z, residual):
 def linearise(points, source, target, camera, motion, pixels, weights, noise, weighting, max_jump_m):
     """System of the pixels (P,), numbers v W + u, how many equations each chunk has, and the largest weights.
 
-    A pixel weighs weights / sqrt(noise + weighting (|gradient|² + residual²)) (Jaimez et al. 2017, eqs. 18
-    and 19), for intensity and depth apart: `weights` (P,), `noise` (2,). Pixels that the target does not see
+    A pixel weighs weights / sqrt(noise + weighting (|gradient|² + residual²)), the pre-weights of Jaimez et
+    al. 2017, for intensity and depth apart: `weights` (P,), `noise` (2,). Pixels that the target does not see
     have no equations.
     """
     chunks = (len(pixels) + CHUNK - 1) // CHUNK

@@ -1,4 +1,4 @@
-"""Robust odometry before anything is known about what moves (Jaimez et al. 2017, section IV-A)."""
+"""Robust odometry before anything is known about what moves (Jaimez et al. 2017)."""
 
 import numpy as np
 
@@ -16,9 +16,10 @@ def robust(
     source: tuple[Level, ...], target: tuple[Level, ...], clusters: Clusters, b_before: np.ndarray,
     config: RgbdConfig,
 ) -> np.ndarray:
-    """target_from_source (4, 4) of most of the image: eqs. 3 to 7, coarse to fine.
+    """target_from_source (4, 4) of most of the image, coarse to fine, minimising Σ F(w r_Z) + F(α_I w r_I).
 
-    Pixels weigh Z1 (1 − B^T), with `b_before` (K,) the previous pair's segmentation in this pair's clusters.
+    w = Z1 (1 − B^T), Z1 to the power of `robust.depth_power`, with `b_before` (K,) the previous pair's
+    segmentation in this pair's clusters; F is the Cauchy loss.
     """
     static = np.append(np.clip(1.0 - b_before, 0.0, 1.0), 0.0).astype(np.float32)
     motion, power = np.eye(4), np.float32(config.robust.depth_power)

@@ -55,23 +55,22 @@ def _estimate(
     with timed("clusters"):
         clusters = geometric.find(source, config.clusters)
         b_before = None if previous is None else propagation.carried(previous, source[0], clusters)
+    nothing_moves = np.zeros(len(clusters.centres))
     with timed("robust odometry"):
-        b_or_static = np.zeros(len(clusters.centres)) if b_before is None else b_before
-        robust = odometry.robust(source, target, clusters, b_or_static, config)
+        static = odometry.robust(
+            source, target, clusters, nothing_moves if b_before is None else b_before, config)
+    b, motions = nothing_moves, np.tile(static, (len(nothing_moves), 1, 1))
     if config.segmentation.enabled:
         with timed("segmentation"):
-            b = segmentation.segment(source[0], target[0], clusters, robust, b_before, config)
+            b = segmentation.segment(source[0], target[0], clusters, static, b_before, config)
         for _ in range(config.refinement.max_rounds):
-            before = b
+            had_own_motion = segmentation.has_own_motion(b, config.segmentation)
             with timed("refinement"):
                 static, motions = refinement.refine(source, target, clusters, b, config)
             with timed("segmentation"):
                 b = segmentation.segment(source[0], target[0], clusters, static, b_before, config)
-            if (segmentation.has_own_motion(b, config.segmentation)
-                    == segmentation.has_own_motion(before, config.segmentation)).all():
+            if (segmentation.has_own_motion(b, config.segmentation) == had_own_motion).all():
                 break
-    else:
-        b, static, motions = b_or_static, robust, np.tile(robust, (len(b_or_static), 1, 1))
     with timed("scene flow"):
         label = clusters.labels[0]
         flow = cluster_images.blended_flow(

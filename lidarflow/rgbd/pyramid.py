@@ -32,7 +32,7 @@ class Level:
 def build(frame: RgbdFrame, camera: Camera, config: ImagesConfig) -> tuple[Level, ...]:
     """The levels of a frame, the finest, of the working size, first.
 
-    Raises DataError for a frame without any depth, or one that is too small.
+    Raises DataError for a frame without any depth, one that is too small, or not of the camera's size.
     """
     intensity, depth, camera = _resized(frame, camera, config)
     levels = [_level(intensity, depth, camera)]
@@ -60,6 +60,10 @@ def _resized(
     frame: RgbdFrame, camera: Camera, config: ImagesConfig
 ) -> tuple[np.ndarray, np.ndarray, Camera]:
     """Intensity and depth (H, W) float32 at the working size, and the camera of that size."""
+    if frame.shape != (camera.height, camera.width):
+        height, width = frame.shape
+        raise DataError(f"{frame.name}: {width}x{height} pixels, but the camera has "
+                        f"{camera.width}x{camera.height}")
     if not frame.depth.any():
         raise DataError(f"{frame.name}: no pixel has a depth; is this the right depth image?")
     camera = working_camera(camera, config)

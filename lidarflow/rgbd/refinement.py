@@ -1,4 +1,4 @@
-"""Odometry from what is static and a motion for every cluster that is not (section IV-C)."""
+"""Odometry from what is static, and a motion for every cluster that is not (Jaimez et al. 2017)."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Which clusters move by themselves: a convex energy with a closed-form minimum (section IV-B)."""
+"""Which clusters move by themselves: a convex energy with a closed-form minimum (Jaimez et al. 2017)."""
 
 import numpy as np
 
@@ -8,6 +8,8 @@ from lidarflow.rgbd.clusters import Clusters
 from lidarflow.rgbd.odometry import rows34
 from lidarflow.rgbd.pyramid import Level
 from lidarflow.rgbd_config import RgbdConfig, SegmentationConfig
+
+_FAR_M = 30.0   # from here on e^Z says static whatever else, and soon overflows
 
 
 def segment(
@@ -23,7 +25,10 @@ def segment(
 def mean_residuals(
     source: Level, target: Level, clusters: Clusters, odometry: np.ndarray, config: RgbdConfig
 ) -> np.ndarray:
-    """δ (K,): α_I mean |r_I| + mean |r_Z| / Z̄ of each cluster after the warp by `odometry` (eq. 8)."""
+    """δ (K,): α_I mean |r_I| + mean |r_Z| / Z̄ of each cluster after the warp by `odometry`.
+
+    Pixels that something nearer hides, that lie at edges or are not seen again are left out.
+    """
     limits = config.segmentation
     sums = cluster_images.residuals(
         source.points, source.packed, target.packed, source.intrinsics, rows34(odometry), clusters.labels[0],
@@ -36,7 +41,11 @@ def mean_residuals(
 
 
 def thresholds(delta: np.ndarray, twist_norm: float, config: SegmentationConfig) -> tuple[float, float]:
-    """δ_L and δ_H: residuals below the first speak for static, above the second for moving (eq. 22)."""
+    """δ_L and δ_H: residuals below the first speak for static, above the second for moving.
+
+    They grow by a factor with the motion, as in the authors' program; eq. 22 adds, which would leave nothing
+    above them.
+    """
     growth = config.threshold_per_motion * twist_norm
     typical = float(np.quantile(delta, config.quantile))
     base = max(config.min_threshold, min(config.max_threshold * (1.0 + growth), typical))
@@ -57,7 +66,7 @@ def minimise(
     w_data = np.sqrt(((delta - 0.5 * (lower + upper)) / half_width) ** 2 + 1.0)
     z = clusters.centres[:, 2].astype(float)
     z_min = (1.0 - config.far_share) * z.min() + config.far_share * z.max()
-    w_depth = config.depth * np.maximum(0.0, np.exp(z) - np.exp(z_min))
+    w_depth = config.depth * np.maximum(0.0, np.exp(np.minimum(z, _FAR_M)) - np.exp(min(z_min, _FAR_M)))
 
     edges = (clusters.touch & ~np.eye(len(z), dtype=bool)).astype(float)
     laplacian = np.diag(edges.sum(axis=1)) - edges
