@@ -288,15 +288,16 @@ def solve_each(points, source, target, camera, motions, pixels, starts, noise, m
     """
     twists = np.zeros((len(motions), 6))
     points, source = points.reshape(-1, 3), source.reshape(-1, 6)
-    sizes = starts[1:] - starts[:-1]
     systems = np.empty((len(motions) + len(pixels) // CHUNK + 1, 2, 7, CHUNK), np.float32)
     first = np.zeros(len(motions) + 1, np.int64)
-    first[1:] = np.cumsum((sizes + CHUNK - 1) // CHUNK)
-    by_size = np.argsort(-sizes)
-    order = np.concatenate((by_size[::2], by_size[1::2]))   # so that two threads have as much to do
+    for k in range(len(motions)):
+        first[k + 1] = first[k] + (starts[k + 1] - starts[k] + CHUNK - 1) // CHUNK
+    by_size = np.argsort(starts[:-1] - starts[1:])
+    half = (len(motions) + 1) // 2
     ones = np.ones(CHUNK, np.float32)
     for job in numba.prange(len(motions)):
-        k = order[job]
+        # Every other one to each half of the jobs, so that two threads have as much to do.
+        k = by_size[2 * job] if job < half else by_size[2 * (job - half) + 1]
         system, largest = systems[first[k]:first[k + 1]], np.zeros(2, np.float32)
         counts = np.zeros(len(system), np.int64)
         for chunk in range(len(system)):

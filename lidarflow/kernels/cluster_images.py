@@ -116,52 +116,43 @@ def _distance_sq(a, b):
     return x * x + y * y + z * z
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True)
 def members(points, label, centres, touch, per_m2, min_weight, wanted):
     """Pixels of each wanted cluster (K,) bool: numbers v W + u in ascending order, and where each set starts.
 
     A pixel is a member where its blending weight exceeds `min_weight`. Set k is
     pixels[starts[k] : starts[k + 1]]; it is empty for clusters that are not wanted.
     """
-    rows, columns = label.shape
     count = len(centres)
+    points, label = points.reshape(-1, 3), label.ravel()
     near, number = _neighbours(touch)
     useful = np.zeros(count, np.bool_)
     for own in range(count):
         for k in near[own, :number[own]]:
             useful[own] |= wanted[k]
-    belongs = np.zeros((rows, columns, number.max()), np.bool_)
-    per_row = np.zeros((rows, count), np.int64)
-    for v in numba.prange(rows):
-        weights = np.empty(count, np.float32)
-        for u in range(columns):
-            own = label[v, u]
-            if own < 0 or not useful[own]:
-                continue
-            around = near[own, :number[own]]
-            _blending(points[v, u], own, centres, around, per_m2, weights)
-            for i in range(len(around)):
-                if wanted[around[i]] and weights[i] > min_weight:
-                    belongs[v, u, i] = True
-                    per_row[v, around[i]] += 1
+    belongs = np.zeros((len(label), number.max()), np.bool_)
     starts = np.zeros(count + 1, np.int64)
-    first = np.zeros((rows, count), np.int64)
+    weights = np.empty(count, np.float32)
+    for pixel in range(len(label)):
+        own = label[pixel]
+        if own < 0 or not useful[own]:
+            continue
+        _blending(points[pixel], own, centres, near[own, :number[own]], per_m2, weights)
+        for i in range(number[own]):
+            if wanted[near[own, i]] and weights[i] > min_weight:
+                belongs[pixel, i] = True
+                starts[near[own, i] + 1] += 1
     for k in range(count):
-        starts[k + 1] = starts[k]
-        for v in range(rows):
-            first[v, k] = starts[k + 1]
-            starts[k + 1] += per_row[v, k]
-    pixels = np.empty(starts[count], np.int32)
-    for v in numba.prange(rows):
-        for u in range(columns):
-            own = label[v, u]
-            if own < 0 or not useful[own]:
-                continue
-            for i in range(number[own]):
-                if belongs[v, u, i]:
-                    k = near[own, i]
-                    pixels[first[v, k]] = v * columns + u
-                    first[v, k] += 1
+        starts[k + 1] += starts[k]
+    pixels, following = np.empty(starts[count], np.int64), starts.copy()
+    for pixel in range(len(label)):
+        own = label[pixel]
+        if own < 0 or not useful[own]:
+            continue
+        for i in range(number[own]):
+            if belongs[pixel, i]:
+                pixels[following[near[own, i]]] = pixel
+                following[near[own, i]] += 1
     return pixels, starts
 
 
