@@ -11,8 +11,10 @@ import typer
 from lidarflow.terminal import check_live_view, progress, show, working
 
 if TYPE_CHECKING:
+    from lidarflow.datasets.rgbd_folders import RgbdFolder
     from lidarflow.rgbd_config import RgbdConfig
     from lidarflow.rgbd_runner import RgbdReport
+    from lidarflow.runner import Viewing
 
 app = typer.Typer(
     help="Odometry and scene flow from RGB-D images.",
@@ -95,24 +97,59 @@ def run(
     overrides: Overrides = None,
 ) -> None:
     """Odometry and scene flow along a sequence of RGB-D images."""
-    from lidarflow import rgbd_methods, rgbd_runner, runner
+    from lidarflow import rgbd_methods
     from lidarflow.datasets.rgbd_folders import CameraChoice, open_rgbd
-    from lidarflow.rgbd_tables import run_notes, run_table
+    from lidarflow.runner import Viewing
 
     settings = _settings(config, overrides)
     rgbd_methods.check(method)
-    check_live_view(visualize)
     folder = open_rgbd(data, CameraChoice(camera, intrinsics), depth_scale)
     print(f"reading    {data}: {len(folder)} frames")
     for note in folder.notes:
         print(f"note       {note}")
+    _process(folder, method, settings, out, Viewing(record, visualize), jump, n_frames)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Where the results go.")] = Path("rgbd_demo"),
+    visualize: Visualize = False,
+) -> None:
+    """Render a room, process it, score it and picture it."""
+    from lidarflow import demo as generated
+    from lidarflow.datasets.rgbd_folders import open_rgbd
+    from lidarflow.runner import Viewing
+
+    generated.check_folder(out)
+    with working("rendering a room"):
+        data = generated.generate_room(out / generated.DATA_FOLDER)
+    folder = open_rgbd(data)
+    print(f"generated  {data}: {len(folder)} frames with truth, in TUM's layout")
+    _process(folder, "ours", _settings(None, None), out / generated.RUN_FOLDER, Viewing(visualize=visualize))
+
+
+@app.command(name="config")
+def show_config() -> None:
+    """List every RGB-D setting, its default and effect."""
+    from lidarflow.rgbd_config import RgbdConfig
+    from lidarflow.tables import config_table
+
+    show(config_table(RgbdConfig))
+
+
+def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Path, viewing: "Viewing",
+             jump: int = 0, n_frames: int | None = None) -> None:
+    """Run over a folder and say what was found."""
+    from lidarflow import rgbd_runner, runner
+    from lidarflow.rgbd_tables import run_notes, run_table
+
+    check_live_view(viewing.visualize)
     frames = runner.choose_frames(folder, jump, n_frames, "frames")
     with progress("frame pairs", len(frames) - 1) as bar:
 
         def on_pair(report: "RgbdReport") -> None:
             bar.update(0, advance=1, description=f"frame pairs, {report.frame} done")
 
-        viewing = runner.Viewing(record, visualize)
         done = rgbd_runner.process(folder, frames, method, settings, out, viewing, on_pair)
     print()
     show(run_table(done))
@@ -123,18 +160,9 @@ def run(
     print(f"results    {out}")
     print(f"metrics    {out / 'metrics.json'}")
     print(f"picture    {out / 'preview.png'}   (the last pair)")
-    if record:
+    if viewing.record:
         print(f"recording  {out / 'recording.rrd'}")
         print(f"look at it with: lidarflow view {out}")
-
-
-@app.command(name="config")
-def show_config() -> None:
-    """List every RGB-D setting, its default and effect."""
-    from lidarflow.rgbd_config import RgbdConfig
-    from lidarflow.tables import config_table
-
-    show(config_table(RgbdConfig))
 
 
 def _settings(file: Path | None, overrides: list[str] | None) -> "RgbdConfig":

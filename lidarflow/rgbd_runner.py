@@ -16,6 +16,8 @@ from lidarflow.rgbd_metrics import DepthStatistics, Drift, RgbdScores, WarpScore
 from lidarflow.rgbd_types import RgbdPair, RgbdResult, RgbdTruth
 from lidarflow.runner import Viewing, recording
 
+OUTPUT_STAGE = "scores and output"
+
 
 @dataclass(frozen=True, slots=True)
 class RgbdReport:
@@ -76,7 +78,7 @@ def process(
                 rgbd_viewer.log_pair(stream, index, pair, result, report.residuals, poses[-1])
             poses.append(poses[-1] @ pose.inverse(result.odometry))
             times_ns.append(pair.source.time_ns)
-            with_output = {**report.seconds, "scores and output": time.perf_counter() - begin}
+            with_output = {**report.seconds, OUTPUT_STAGE: time.perf_counter() - begin}
             reports.append(replace(report, seconds=with_output))
             on_pair(reports[-1])
     poses, times_ns = np.stack(poses), [*times_ns, pair.target.time_ns]

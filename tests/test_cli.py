@@ -396,7 +396,8 @@ def test_the_demo_leaves_foreign_folders_alone(lidarflow, tmp_path):
 
 
 def test_an_interrupted_demo_leaves_no_half_of_its_data(tmp_path, monkeypatch):
-    monkeypatch.setattr(synthetic, "scan_sequence", lambda *args: drive()[:args[2]])
+    sequence = drive()     # made before the patch, which it would call
+    monkeypatch.setattr(synthetic, "scan_sequence", lambda *args: sequence[:args[2]])
 
     def stop(folder, sequence):
         folder.mkdir(parents=True)

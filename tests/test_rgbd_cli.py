@@ -12,7 +12,7 @@ from command_line import Program, rests
 from PIL import Image
 from rgbd_worlds import FRAMES, QVGA, frames
 
-from lidarflow import config, pose, rgbd, rgbd_io, rgbd_methods, synthetic
+from lidarflow import config, demo, pose, rgbd, rgbd_io, rgbd_methods, synthetic
 from lidarflow.datasets.rgbd_folders import open_rgbd
 from lidarflow.datasets.rgbd_images import read_frame
 from lidarflow.rgbd_config import RgbdConfig
@@ -225,6 +225,18 @@ def test_part_of_a_sequence_by_another_method(lidarflow, folder, tmp_path):
     assert json.loads((tmp_path / "part" / "metrics.json").read_text())["method"] == "open3d"
     lidarflow.ok("view", "part", "--save", "copy.rrd")
     assert (tmp_path / "copy.rrd").read_bytes() == (tmp_path / "part" / "recording.rrd").read_bytes()
+
+
+def test_the_demo_runs_twice_into_one_folder(lidarflow, tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "FRAMES", 3)
+    for _ in range(2):
+        out = lidarflow.ok("rgbd", "demo", "--out", "demo")
+        assert "3 frames with truth" in out and "IoU" in out and "lidarflow view demo" in out
+        assert set(os.listdir("demo")) == {"data", "run", "latest"}
+    assert sorted(os.listdir("demo/run/flow")) == ["0.000000.npz", "0.033333.npz"] and not rests(tmp_path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").touch()
+    assert "thesis.txt" in lidarflow.complaint("rgbd", "demo", "--out", "mine")
 
 
 # What cannot be used: one line, exit code 1, nothing written.
