@@ -12,6 +12,11 @@ import typer
 
 from lidarflow import __version__
 from lidarflow.errors import LidarflowError
+from lidarflow.rgbd_cli import app as rgbd_app
+from lidarflow.terminal import check_live_view as _check_live_view
+from lidarflow.terminal import progress as _progress
+from lidarflow.terminal import show as _print
+from lidarflow.terminal import working as _working
 
 if TYPE_CHECKING:
     from lidarflow.config import Config
@@ -23,6 +28,7 @@ _INTERRUPTED = 130     # what typer makes of Ctrl-C
 app = typer.Typer(
     help="Dense rigid scene flow: a rigid motion for every LiDAR point between consecutive scans.",
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app.add_typer(rgbd_app, name="rgbd")
 
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="TOML file with differences from the defaults.")]
@@ -168,7 +174,7 @@ def compare(
         io.check_output("--out", out, ".json", inputs=(data,))
     dataset = _open(data, dataloader, sequence, settings)
     frames = runner.choose_frames(dataset, jump, n_scans)
-    with _progress(len(frames) - 1) as on_pair:
+    with _pairs_done(len(frames) - 1) as on_pair:
         found = comparing.compare(dataset, frames, chosen, settings, on_pair)
     print()
     _print(tables.compare_table(found))
@@ -237,7 +243,7 @@ def view(
     import shutil
     import tempfile
 
-    from lidarflow import io, viewer
+    from lidarflow import io, rgbd_io, viewer
 
     if save is not None:
         io.check_output("--save", save, ".rrd", inputs=(what,))
@@ -253,7 +259,7 @@ def view(
         _record_flow_file(what, target, save)
         print(f"recording  {save}")
     else:
-        io.load_flow(what)
+        rgbd_io.load_flow(what) if rgbd_io.is_rgbd_flow(what) else io.load_flow(what)
         viewer.require_display(f"make a recording with: lidarflow view {what} --save FILE.rrd")
         with tempfile.TemporaryDirectory() as folder:
             recording = Path(folder) / "flow.rrd"
@@ -304,16 +310,10 @@ def _open(data: Path, dataloader: str | None, sequence: str | None, settings: "C
 
 
 @contextlib.contextmanager
-def _progress(pairs: int):
+def _pairs_done(pairs: int):
     """A bar on standard error; yields what to call with the name of every finished pair."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
-               TimeElapsedColumn())
-    console = _console(sys.stderr)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("scan pairs", total=pairs)
-        yield lambda frame: progress.update(task, advance=1, description=f"scan pairs, {frame} done")
+    with _progress("scan pairs", pairs) as progress:
+        yield lambda frame: progress.update(0, advance=1, description=f"scan pairs, {frame} done")
 
 
 def _process(
@@ -325,7 +325,7 @@ def _process(
 
     _check_live_view(viewing.visualize)
     frames = runner.choose_frames(dataset, jump, n_scans)
-    with _progress(len(frames) - 1) as on_pair:
+    with _pairs_done(len(frames) - 1) as on_pair:
         reports = runner.process(
             dataset, frames, settings, out, viewing, lambda report: on_pair(report.frame), method)
     print()
@@ -356,8 +356,11 @@ def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None
 
 
 def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
-    from lidarflow import datasets, io, viewer
+    from lidarflow import datasets, io, rgbd_io, viewer
 
+    if rgbd_io.is_rgbd_flow(file):
+        _record_rgbd_file(file, target, recording)
+        return
     found = io.load_flow(file)
     correction = found.config.get("preparation", {}).get("kitti_correction", "auto")
     points = None if target is None else datasets.read_scan(target, correction).points
@@ -367,27 +370,14 @@ def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
         viewer.close(stream)
 
 
-def _check_live_view(wanted: bool) -> None:
-    """InstallError before any work where a viewer is wanted and none can be opened."""
-    if wanted:
-        from lidarflow import viewer
+def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:
+    from lidarflow import io, rgbd_io, rgbd_viewer, viewer
+    from lidarflow.errors import DataError
 
-        viewer.require_live_view()
-
-
-def _working(what: str):
-    """A spinner on standard error while something long goes on."""
-    from rich.text import Text
-
-    return _console(sys.stderr).status(Text(what))
-
-
-def _console(file):
-    from rich.console import Console
-
-    # Names of files are shown as they are, not taken for markup or emoji.
-    return Console(file=file, markup=False, emoji=False, highlight=False)
-
-
-def _print(table) -> None:
-    _console(sys.stdout).print(table)
+    if target is not None:
+        raise DataError(f"--target {target}: {file} is of RGB-D images, which need no target to be shown")
+    found = rgbd_io.load_flow(file)
+    with io.written_aside(recording) as aside:
+        stream = rgbd_viewer.open_recording(aside)
+        rgbd_viewer.log_file(stream, found)
+        viewer.close(stream)

@@ -36,7 +36,7 @@ def motion_colours(residual_flow: np.ndarray, is_dynamic: np.ndarray, dt_s: floa
     share = np.clip(share, 0.0, 1.0)
     hue = np.arctan2(y, x) / (2.0 * np.pi) % 1.0
     saturation = _SLOW_SATURATION + share * (_FULL_SATURATION - _SLOW_SATURATION)
-    colours[moving] = np.round(255.0 * _rgb(hue, saturation, _SLOW_VALUE + share * (1.0 - _SLOW_VALUE)))
+    colours[moving] = np.round(255.0 * hsv_to_rgb(hue, saturation, _SLOW_VALUE + share * (1.0 - _SLOW_VALUE)))
     return colours
 
 
@@ -117,7 +117,7 @@ def _label_wheel(draw: ImageDraw.ImageDraw, centre: float, radius: float, full_s
         draw.text((centre + x * reach, centre + y * reach), label, (220, 220, 220), text, anchor=anchor)
 
 
-def _rgb(hue: np.ndarray, saturation: np.ndarray, value: np.ndarray) -> np.ndarray:
+def hsv_to_rgb(hue: np.ndarray, saturation: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Red, green and blue (N, 3) in 0..1 of hue, saturation and value (N,) in 0..1."""
     sector = (np.array([5.0, 3.0, 1.0]) + hue[:, None] * 6.0) % 6.0
     ramp = np.clip(np.minimum(sector, 4.0 - sector), 0.0, 1.0)

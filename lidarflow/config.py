@@ -8,7 +8,7 @@ import difflib
 import sys
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 from lidarflow.errors import ConfigError
 
@@ -16,6 +16,8 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+Settings = TypeVar("Settings")   # a frozen dataclass whose fields are sections, such as Config or RgbdConfig
 
 
 def setting(default: Any, effect: str, *, low: float | None = None, high: float | None = None,
@@ -178,20 +180,22 @@ class Config:
     crispness: CrispnessConfig = field(default_factory=CrispnessConfig)
 
 
-def load(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Config:
-    """Defaults, then a TOML file, then overrides such as "mesh.max_edge_m=0.5".
+def load(
+    file: Path | None = None, overrides: tuple[str, ...] = (), kind: type[Settings] = Config
+) -> Settings:
+    """Defaults of a `kind` of settings, then a TOML file, then overrides such as "mesh.max_edge_m=0.5".
 
     Raises ConfigError for a file that cannot be read, an unknown key, or a value out of range.
     """
-    config = Config()
+    config = kind()
     if file is not None:
-        config = updated(config, _read_toml(Path(file)), str(file))
+        config = updated(config, read_toml(Path(file)), str(file))
     for override in overrides:
         config = updated(config, _parse_override(override), "--set")
     return config
 
 
-def updated(config: Config, changes: dict, origin: str = "settings") -> Config:
+def updated(config: Settings, changes: dict, origin: str = "settings") -> Settings:
     """A copy of `config` with nested `changes` {section: {name: value}}, each of them checked."""
     sections = {f.name for f in fields(config)}
     for section, values in changes.items():
@@ -205,15 +209,15 @@ def updated(config: Config, changes: dict, origin: str = "settings") -> Config:
     return config
 
 
-def to_dict(config: Config) -> dict:
+def to_dict(config: Settings) -> dict:
     """Nested plain values, ready for TOML or JSON."""
     return asdict(config)
 
 
-def describe() -> list[tuple[str, str, str, str]]:
-    """Rows (key, default, allowed, effect) for every setting."""
+def describe(kind: type[Settings] = Config) -> list[tuple[str, str, str, str]]:
+    """Rows (key, default, allowed, effect) for every setting of a `kind`."""
     rows = []
-    for section in fields(Config):
+    for section in fields(kind):
         defaults = section.default_factory()
         for f in fields(defaults):
             meta = f.metadata
@@ -229,11 +233,12 @@ def _range_text(meta: dict) -> str:
     return f"≥ {low:g}" if high is None else f"{low:g} .. {high:g}"
 
 
-def _read_toml(file: Path) -> dict:
+def read_toml(file: Path, what: str = "settings") -> dict:
+    """The content of a TOML file, which messages call a file of `what`; ConfigError if it cannot be read."""
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ConfigError(f"{file}: no such settings file") from None
+        raise ConfigError(f"{file}: no such {what} file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read ({error})") from None
     except tomllib.TOMLDecodeError as error:

@@ -22,6 +22,7 @@ import tomli_w
 from lidarflow import pose
 from lidarflow.config import Config, to_dict
 from lidarflow.errors import DataError
+from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.types import FlowResult, SolveStats
 
 FLOW_FOLDER = "flow"
@@ -122,8 +123,8 @@ def save_flow(path: Path, points: np.ndarray, result: FlowResult, config: Config
         "object": result.object_id.astype(np.int32),
         "std": result.std_m.astype(np.float32),
         "ego_motion": result.ego_motion.astype(np.float64),
-        "config": np.array(_to_json(to_dict(config))),
-        "stats": np.array(_to_json(asdict(result.stats))),
+        "config": np.array(as_json(to_dict(config))),
+        "stats": np.array(as_json(asdict(result.stats))),
     }
     with written_aside(path) as aside, aside.open("wb") as file:
         np.savez_compressed(file, **arrays)
@@ -131,7 +132,7 @@ def save_flow(path: Path, points: np.ndarray, result: FlowResult, config: Config
 
 def load_flow(path: Path) -> FlowFile:
     """Read a flow file; DataError where it is damaged, or not a flow file."""
-    arrays = _read_archive(Path(path))
+    arrays = read_archive(Path(path), (*_ROW_ARRAYS, *_WHOLE_ARRAYS))
     count = len(arrays["flow"]) if arrays["flow"].ndim else 0
     for name, (shape, kind) in (_ROW_ARRAYS | _WHOLE_ARRAYS).items():
         expected = (count, *shape) if name in _ROW_ARRAYS else shape
@@ -178,11 +179,11 @@ def write_objects(path: Path, rows: Iterable[tuple]) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write plain or numpy data as JSON, keys sorted; numbers that are not finite become null."""
-    write_text(path, _to_json(data, indent=2) + "\n")
+    """Write plain or numpy data as `as_json` has it."""
+    write_text(path, as_json(data, indent=2) + "\n")
 
 
-def write_toml(path: Path, config: Config, comment: str = "") -> None:
+def write_toml(path: Path, config: Config | RgbdConfig, comment: str = "") -> None:
     """Write every setting, below a `comment`, in a form that can be read back as a settings file."""
     heading = f"# {comment}\n\n" if comment else ""
     write_text(path, heading + tomli_w.dumps(to_dict(config)))
@@ -288,8 +289,8 @@ def _is_run(names: set[str]) -> bool:
     return FLOW_FOLDER in names and (CONFIG_FILE in names or names == {FLOW_FOLDER})
 
 
-def _read_archive(path: Path) -> dict[str, np.ndarray]:
-    names = [*_ROW_ARRAYS, *_WHOLE_ARRAYS]
+def read_archive(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The arrays of a flow file by their `names`; DataError where it is damaged or lacks one."""
     if not path.is_file():
         found = "is a folder" if path.is_dir() else "no such file"
         raise DataError(f"{path}: {found}; expected a flow file (.npz)")
@@ -325,7 +326,8 @@ def _motions_of_rows(rows: np.ndarray) -> np.ndarray:
     return motions
 
 
-def _to_json(data: Any, indent: int | None = None) -> str:
+def as_json(data: Any, indent: int | None = None) -> str:
+    """Plain or numpy data as JSON, keys sorted; numbers that are not finite become null."""
     return json.dumps(_plain(data), sort_keys=True, indent=indent, allow_nan=False, ensure_ascii=False)
 
 

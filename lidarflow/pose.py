@@ -118,6 +118,14 @@ def interpolate(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     return start @ exp(share * log(inverse(start) @ end))
 
 
+def trajectory(steps: np.ndarray) -> np.ndarray:
+    """Poses (N + 1, 4, 4), first_from_each, of a sensor whose `steps` (N, 4, 4) are target_from_source."""
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ inverse(step))
+    return np.stack(poses)
+
+
 def translation_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Distance in metres (...) between the origins of motions (..., 4, 4)."""
     return np.linalg.norm((inverse(a) @ b)[..., :3, 3], axis=-1)

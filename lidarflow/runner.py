@@ -52,17 +52,17 @@ class PairReport:
     valid_share: float = float("nan")
 
 
-def choose_frames(dataset: Dataset, jump: int, count: int | None) -> list[int]:
-    """Indices of the scans to process: from `jump` on, `count` of them; DataError for fewer than two."""
-    for option, value in (("--jump", jump), ("--n-scans", count)):
+def choose_frames(dataset: Dataset, jump: int, count: int | None, what: str = "scans") -> list[int]:
+    """Indices of the scans (`what`) to process: `count` from `jump` on; DataError for fewer than two."""
+    for option, value in (("--jump", jump), (f"--n-{what}", count)):
         if value is not None and value < 0:
             raise DataError(f"{option} {value}: must not be negative")
     last = len(dataset) if count is None else min(len(dataset), jump + count)
     frames = list(range(jump, last))
     if len(frames) < 2:
         raise DataError(
-            f"{dataset.name}: {len(frames)} of {len(dataset)} scans selected; flow needs at least two, "
-            "see --n-scans and --jump")
+            f"{dataset.name}: {len(frames)} of {len(dataset)} {what} selected; flow needs at least two, "
+            f"see --n-{what} and --jump")
     return frames
 
 
@@ -85,7 +85,7 @@ def process(
     io.write_toml(out / io.CONFIG_FILE, config, f"Method: {method}")
     provenance.write(out, provenance.RunSource(dataset.source, tuple(frames)))
     world_from_sensor, times_ns, objects = [np.eye(4)], [], []
-    with _recording(out / io.RECORDING_FILE, viewing) as stream:
+    with recording(out / io.RECORDING_FILE, viewing, _open_recording) as stream:
         for index, (pair, result) in zip(frames, _chained(first, results), strict=False):
             begin = time.perf_counter()
             io.save_flow(out / io.FLOW_FOLDER / f"{pair.source.name}.npz", pair.source.points, result, config)
@@ -251,9 +251,18 @@ def _explained(
         raise type(error)(f"{error} (scans {index} and {index + 1} of {dataset.name}{kept})") from error
 
 
+def _open_recording(path: Path | None, spawn: bool):
+    from lidarflow import viewer
+
+    return viewer.open_recording(path, spawn=spawn)
+
+
 @contextlib.contextmanager
-def _recording(path: Path, viewing: Viewing):
-    """The viewer's stream, its file moved into place once complete; None when nothing is to be shown."""
+def recording(path: Path, viewing: Viewing, open_recording: Callable):
+    """The viewer's stream, its file moved into place once complete; None when nothing is to be shown.
+
+    open_recording  (path or None, whether to start a viewer) -> the stream
+    """
     if not (viewing.record or viewing.visualize):
         yield None
         return
@@ -261,6 +270,6 @@ def _recording(path: Path, viewing: Viewing):
 
     with contextlib.ExitStack() as stack:
         aside = stack.enter_context(io.written_aside(path)) if viewing.record else None
-        stream = viewer.open_recording(aside, spawn=viewing.visualize)
+        stream = open_recording(aside, viewing.visualize)
         stack.callback(viewer.close, stream)
         yield stream

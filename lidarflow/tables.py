@@ -149,13 +149,13 @@ def pair_table(pair: ScanPair, result: FlowResult, alignment: Alignment) -> Tabl
     return table
 
 
-def config_table() -> Table:
-    """Every setting with its default, its effect and what it may be."""
+def config_table(kind: type = Config) -> Table:
+    """Every setting of a `kind` with its default, its effect and what it may be."""
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, pad_edge=False)
     for name in ("setting", "default"):
         table.add_column(name, no_wrap=True)
     table.add_column("effect (allowed values)")
-    for name, default, allowed, effect in describe():
+    for name, default, allowed, effect in describe(kind):
         shown = default if len(default) <= _DEFAULT_CHARS else f"{float(default):.4g}"
         table.add_row(name, shown, f"{effect} ({allowed})" if allowed else effect)
     return table

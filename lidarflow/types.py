@@ -10,26 +10,7 @@ from enum import IntEnum
 import numpy as np
 
 from lidarflow import pose
-
-
-def _check(name: str, array: np.ndarray, shape: tuple, kind: str) -> None:
-    """Raise ValueError unless `array` has `shape` (None = any length) and dtype kind in `kind`."""
-    if not isinstance(array, np.ndarray):
-        raise ValueError(f"{name}: expected a numpy array, got {type(array).__name__}")
-    wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ")"
-    fits = array.ndim == len(shape) and all(
-        n is None or n == m for n, m in zip(shape, array.shape, strict=True)
-    )
-    if not fits:
-        raise ValueError(f"{name}: expected shape {wanted}, got {array.shape}")
-    if array.dtype.kind not in kind:
-        raise ValueError(f"{name}: expected dtype kind {kind!r}, got {array.dtype}")
-
-
-def _check_motion(name: str, motion: np.ndarray) -> None:
-    _check(name, motion, (4, 4), "f")
-    if not pose.is_rigid(motion, tolerance=1e-4):
-        raise ValueError(f"{name}: expected a rigid motion, got\n{motion}")
+from lidarflow.checks import check, check_motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +27,7 @@ class Scan:
     name: str = "scan"
 
     def __post_init__(self):
-        _check(f"{self.name}: points", self.points, (None, 3), "f")
+        check(f"{self.name}: points", self.points, (None, 3), "f")
         object.__setattr__(self, "points", np.ascontiguousarray(self.points, np.float64))
 
     def __len__(self) -> int:
@@ -105,19 +86,19 @@ class Truth:
     origin: str = "flow"
 
     def __post_init__(self):
-        _check("Truth.flow", self.flow, (None, 3), "f")
+        check("Truth.flow", self.flow, (None, 3), "f")
         n = len(self.flow)
         if self.is_ground is None:
             object.__setattr__(self, "is_ground", np.zeros(n, bool))
         if self.category is not None:
-            _check("Truth.category", self.category, (n,), "iu")
+            check("Truth.category", self.category, (n,), "iu")
             if not np.isin(self.category, list(Category)).all():
                 raise ValueError(f"Truth.category: expected numbers of {', '.join(c.name for c in Category)}")
-        _check("Truth.is_ground", self.is_ground, (n,), "b")
-        _check("Truth.valid", self.valid, (n,), "b")
-        _check("Truth.is_dynamic", self.is_dynamic, (n,), "b")
-        _check("Truth.object_id", self.object_id, (n,), "i")
-        _check_motion("Truth.ego_motion", self.ego_motion)
+        check("Truth.is_ground", self.is_ground, (n,), "b")
+        check("Truth.valid", self.valid, (n,), "b")
+        check("Truth.is_dynamic", self.is_dynamic, (n,), "b")
+        check("Truth.object_id", self.object_id, (n,), "i")
+        check_motion("Truth.ego_motion", self.ego_motion)
 
     @property
     def is_foreground(self) -> np.ndarray:
@@ -153,15 +134,15 @@ class FlowProblem:
     group_motions: np.ndarray = field(default_factory=lambda: np.empty((0, 4, 4)))
 
     def __post_init__(self):
-        _check("FlowProblem.points", self.points, (None, 3), "f")
+        check("FlowProblem.points", self.points, (None, 3), "f")
         m = len(self.points)
-        _check("FlowProblem.initial", self.initial, (m, 4, 4), "f")
-        _check("FlowProblem.match_index", self.match_index, (None,), "i")
-        _check("FlowProblem.match_target", self.match_target, (len(self.match_index), 3), "f")
-        _check("FlowProblem.edges", self.edges, (None, 2), "i")
-        _check("FlowProblem.component", self.component, (m,), "i")
-        _check("FlowProblem.group", self.group, (m if len(self.group) else 0,), "i")
-        _check("FlowProblem.group_motions", self.group_motions, (None, 4, 4), "f")
+        check("FlowProblem.initial", self.initial, (m, 4, 4), "f")
+        check("FlowProblem.match_index", self.match_index, (None,), "i")
+        check("FlowProblem.match_target", self.match_target, (len(self.match_index), 3), "f")
+        check("FlowProblem.edges", self.edges, (None, 2), "i")
+        check("FlowProblem.component", self.component, (m,), "i")
+        check("FlowProblem.group", self.group, (m if len(self.group) else 0,), "i")
+        check("FlowProblem.group_motions", self.group_motions, (None, 4, 4), "f")
         if self.group.size and self.group.max() >= len(self.group_motions):
             raise ValueError(f"FlowProblem.group: there are {len(self.group_motions)} group motions")
         for name, index in (("match_index", self.match_index), ("edges", self.edges)):
@@ -219,9 +200,9 @@ class MovingObject:
     points: int
 
     def __post_init__(self):
-        _check_motion("MovingObject.motion", self.motion)
+        check_motion("MovingObject.motion", self.motion)
         for name in ("velocity", "box_centre", "box_size"):
-            _check(f"MovingObject.{name}", getattr(self, name), (3,), "f")
+            check(f"MovingObject.{name}", getattr(self, name), (3,), "f")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,7 +241,7 @@ class FlowResult:
     std_m: np.ndarray | None = None
 
     def __post_init__(self):
-        _check("FlowResult.flow", self.flow, (None, 3), "f")
+        check("FlowResult.flow", self.flow, (None, 3), "f")
         n = len(self.flow)
         if self.is_ground is None:
             object.__setattr__(self, "is_ground", np.zeros(n, bool))
@@ -268,14 +249,14 @@ class FlowResult:
             object.__setattr__(self, "object_id", np.full(n, -1, np.int32))
         if self.std_m is None:
             object.__setattr__(self, "std_m", np.full(n, np.nan))
-        _check("FlowResult.std_m", self.std_m, (n,), "f")
-        _check("FlowResult.motions", self.motions, (n, 4, 4), "f")
+        check("FlowResult.std_m", self.std_m, (n,), "f")
+        check("FlowResult.motions", self.motions, (n, 4, 4), "f")
         for name in ("valid", "in_graph", "is_ground", "is_dynamic"):
-            _check(f"FlowResult.{name}", getattr(self, name), (n,), "b")
-        _check("FlowResult.object_id", self.object_id, (n,), "i")
-        _check("FlowResult.match_source", self.match_source, (None, 3), "f")
-        _check("FlowResult.match_target", self.match_target, (len(self.match_source), 3), "f")
-        _check_motion("FlowResult.ego_motion", self.ego_motion)
+            check(f"FlowResult.{name}", getattr(self, name), (n,), "b")
+        check("FlowResult.object_id", self.object_id, (n,), "i")
+        check("FlowResult.match_source", self.match_source, (None, 3), "f")
+        check("FlowResult.match_target", self.match_target, (len(self.match_source), 3), "f")
+        check_motion("FlowResult.ego_motion", self.ego_motion)
 
     def ego_flow(self, points: np.ndarray) -> np.ndarray:
         """Flow (N, 3) in metres that the sensor's own motion gives `points` (N, 3)."""

@@ -17,6 +17,7 @@ import rerun.blueprint as rrb
 
 from lidarflow import colour, pose
 from lidarflow.errors import DataError, InstallError
+from lidarflow.rgbd_types import RgbdPair
 from lidarflow.types import FlowResult, ScanPair
 
 FRAME, TIME = "frame", "time"
@@ -43,19 +44,26 @@ _VIEWER_START_S = 20.0
 
 def open_recording(path: Path | None, application_id: str = "lidarflow",
                    spawn: bool = False) -> rr.RecordingStream:
-    """A stream that writes to the file `path`, to a viewer it starts (`spawn`), or to both."""
+    """A stream of scans that writes to the file `path`, to a viewer it starts (`spawn`), or to both."""
+    stream = open_stream(path, application_id, spawn, blueprint())
+    _log_static(stream)
+    return stream
+
+
+def open_stream(path: Path | None, application_id: str, spawn: bool,
+                layout: rrb.Blueprint) -> rr.RecordingStream:
+    """An empty stream with a `layout` to a file, a viewer it starts (`spawn`), or both."""
     if path is None and not spawn:
-        raise ValueError("open_recording: give a path, spawn, or both")
+        raise ValueError("open_stream: give a path, spawn, or both")
     if spawn:
         _start_viewer()
     stream = rr.RecordingStream(application_id)
     try:
         sinks = [rr.FileSink(str(path))] if path is not None else []
         sinks += [rr.GrpcSink(f"rerun+http://127.0.0.1:{_PORT}/proxy")] if spawn else []
-        stream.set_sinks(*sinks, default_blueprint=blueprint())
+        stream.set_sinks(*sinks, default_blueprint=layout)
     except RuntimeError as error:
         raise DataError(f"{path}: the recording cannot be written ({error})") from None
-    _log_static(stream)
     return stream
 
 
@@ -73,7 +81,7 @@ def log_pair(stream: rr.RecordingStream, index: int, pair: ScanPair, result: Flo
     crispness          (before, after) the flow moved the source scan, or None
     world_from_source  (4, 4) where the source scan was taken
     """
-    _set_times(stream, index, pair)
+    set_times(stream, index, pair)
     points = pair.source.points
     _log_frames(stream, world_from_source, result.ego_motion)
     _log_motion(stream, points, result.flow, result.is_dynamic, result.ego_motion, pair.dt_s)
@@ -111,7 +119,7 @@ def blueprint(with_alignment: bool = True, with_crispness: bool = True) -> rrb.B
         name="Motion over ground", origin=SOURCE, contents=[f"{SOURCE}/**", f"{TRAJECTORY}/**"],
         background=list(colour.BACKGROUND), line_grid=False,
         eye_controls=_eye((-19.0, 0.0, 15.0), (9.0, 0.0, -2.0)),
-        overrides={MATCHES: rrb.EntityBehavior(visible=False), TRAJECTORY: _all_until_now()})
+        overrides={MATCHES: rrb.EntityBehavior(visible=False), TRAJECTORY: all_until_now()})
     alignment = rrb.Spatial3DView(
         name="Alignment: moved scan (orange) over the next (blue)", origin=TARGET,
         background=list(colour.BACKGROUND), line_grid=False,
@@ -141,7 +149,7 @@ def _eye(position: tuple, target: tuple) -> rrb.EyeControls3D:
                              eye_up=(0.0, 0.0, 1.0))
 
 
-def _all_until_now() -> rrb.VisibleTimeRanges:
+def all_until_now() -> rrb.VisibleTimeRanges:
     """Show every frame logged up to the time cursor, on either timeline."""
     return rrb.VisibleTimeRanges([
         rrb.VisibleTimeRange(FRAME, start=rrb.TimeRangeBoundary.infinite(),
@@ -150,7 +158,7 @@ def _all_until_now() -> rrb.VisibleTimeRanges:
                              end=rrb.TimeRangeBoundary.cursor_relative(seconds=0))])
 
 
-def _set_times(stream: rr.RecordingStream, index: int, pair: ScanPair) -> None:
+def set_times(stream: rr.RecordingStream, index: int, pair: ScanPair | RgbdPair) -> None:
     """The frame, and the time where the scans have one: a date if it counts from 1970, else a duration."""
     stream.set_time(FRAME, sequence=index)
     if pair.target.time_ns <= pair.source.time_ns:
@@ -192,7 +200,7 @@ def _log_motion(stream: rr.RecordingStream, points: np.ndarray, flow: np.ndarray
     colours = colour.motion_colours(residual_flow, moving, dt_s)
     _log_points(stream, STATIC, points[static], colour.static_shade(points[static]), _STATIC_PX)
     _log_points(stream, MOVING, points[moving], colours[moving], _MOVING_PX)
-    shown = _thinned(moving, MAX_RESIDUAL_ARROWS)
+    shown = thinned(moving, MAX_RESIDUAL_ARROWS)
     _log_arrows(stream, RESIDUAL_ARROWS, points[shown], residual_flow[shown], colours[shown], 0.7)
 
 
@@ -244,7 +252,7 @@ def _log_matches(stream: rr.RecordingStream, result: FlowResult) -> None:
 
 
 def _log_total_arrows(stream: rr.RecordingStream, points: np.ndarray, flow: np.ndarray) -> None:
-    shown = _thinned(np.isfinite(points + flow).all(axis=1), MAX_TOTAL_ARROWS)
+    shown = thinned(np.isfinite(points + flow).all(axis=1), MAX_TOTAL_ARROWS)
     _log_arrows(stream, TOTAL_ARROWS, points[shown], flow[shown], [(110, 110, 130)], 0.4)
 
 
@@ -259,7 +267,7 @@ def _log_arrows(stream: rr.RecordingStream, entity: str, origins: np.ndarray, ve
                                    colors=colours, radii=rr.Radius.ui_points(size_px)))
 
 
-def _thinned(mask: np.ndarray, limit: int) -> np.ndarray:
+def thinned(mask: np.ndarray, limit: int) -> np.ndarray:
     """Indices of the rows in `mask`, evenly thinned to at most `limit`."""
     rows = np.flatnonzero(mask)
     return rows[:: max(1, -(-len(rows) // limit))]

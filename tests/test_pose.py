@@ -176,3 +176,11 @@ def test_alignment_of_three_points_of_a_plane():
     known = pose.exp(twists(2, 1.0, seed=11)[1])
     points = rng(12).normal(size=(3, 3))
     np.testing.assert_allclose(pose.aligned(points, pose.apply(known, points)), known, atol=1e-9)
+
+
+def test_a_trajectory_undoes_its_steps():
+    steps = pose.exp(np.random.default_rng(3).normal(scale=0.3, size=(4, 6)))
+    poses = pose.trajectory(steps)
+    np.testing.assert_array_equal(poses[0], np.eye(4))
+    np.testing.assert_allclose(pose.inverse(poses[1:]) @ poses[:-1], steps, atol=1e-12)
+    assert pose.trajectory(np.empty((0, 4, 4))).shape == (1, 4, 4)

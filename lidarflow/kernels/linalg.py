@@ -47,3 +47,24 @@ def symmetric_eigen3(a00, a01, a02, a11, a12, a22, values, vectors):
                 values[j], values[j + 1] = values[j + 1], values[j]
                 for k in range(3):
                     vectors[k, j], vectors[k, j + 1] = vectors[k, j + 1], vectors[k, j]
+
+
+@numba.njit(cache=True)
+def solve_positive6(matrix, right):
+    """Solve matrix x = right, positive definite (6, 6); x replaces right (6,), and matrix is overwritten."""
+    for j in range(6):
+        for k in range(j):
+            matrix[j, j] -= matrix[j, k] * matrix[j, k]
+        matrix[j, j] = math.sqrt(matrix[j, j])
+        for i in range(j + 1, 6):
+            for k in range(j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] /= matrix[j, j]
+    for i in range(6):
+        for k in range(i):
+            right[i] -= matrix[i, k] * right[k]
+        right[i] /= matrix[i, i]
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
+            right[i] -= matrix[k, i] * right[k]
+        right[i] /= matrix[i, i]

@@ -1,0 +1,57 @@
+"""Robust odometry before anything is known about what moves (Jaimez et al. 2017)."""
+
+import numpy as np
+
+from lidarflow import pose
+from lidarflow.kernels import alignment
+from lidarflow.rgbd.clusters import Clusters
+from lidarflow.rgbd.pyramid import Level
+from lidarflow.rgbd_config import AlignmentConfig, RgbdConfig
+
+_NO_NOISE_MODEL = np.ones(2, np.float32)
+_WORTH_SHARING = 300_000   # numbers in a system: for fewer, waking a second thread takes longer than the sums
+
+
+def robust(
+    source: tuple[Level, ...], target: tuple[Level, ...], clusters: Clusters, b_before: np.ndarray,
+    config: RgbdConfig,
+) -> np.ndarray:
+    """target_from_source (4, 4) of most of the image, coarse to fine, minimising Σ F(w r_Z) + F(α_I w r_I).
+
+    w = Z1 (1 − B^T), Z1 to the power of `robust.depth_power`, with `b_before` (K,) the previous pair's
+    segmentation in this pair's clusters; F is the Cauchy loss.
+    """
+    static = np.append(np.clip(1.0 - b_before, 0.0, 1.0), 0.0).astype(np.float32)
+    motion, power = np.eye(4), np.float32(config.robust.depth_power)
+    for level in reversed(range(len(source))):
+        weight = source[level].points[..., 2] ** power * static[clusters.labels[level]]
+        for _ in range(config.robust.max_warps):
+            twist = step(source[level], target[level], motion, weight, _NO_NOISE_MODEL, 0.0,
+                         config.robust.cauchy_scale, config.alignment)
+            motion = pose.exp(twist) @ motion
+            if np.linalg.norm(twist) < config.robust.small_step:
+                break
+    return motion
+
+
+def rows34(motion: np.ndarray) -> np.ndarray:
+    """The upper rows (..., 3, 4) float32 of motions (..., 4, 4), as kernels take them."""
+    return np.ascontiguousarray(motion[..., :3, :], np.float32)
+
+
+def step(
+    source: Level, target: Level, motion: np.ndarray, weight: np.ndarray, noise: np.ndarray, weighting: float,
+    cauchy_scale: float, config: AlignmentConfig,
+) -> np.ndarray:
+    """Twist (6,) that improves a motion (4, 4) of all pixels of a `weight` (H, W) over 0, after one warp.
+
+    `noise` and `weighting` are those of `alignment.linearise`; its weights are divided by the largest.
+    """
+    pixels = np.flatnonzero(weight)
+    system, counts, largest_weights = alignment.linearise(
+        source.points, source.packed, target.packed, source.intrinsics, rows34(motion), pixels,
+        weight.ravel()[pixels], noise, np.float32(weighting), np.float32(config.max_jump_m))
+    scales = np.array([config.photometric_weight, 1.0]) / np.maximum(largest_weights, 1e-12)
+    return alignment.solve(
+        system, counts, scales, cauchy_scale, config.max_irls_rounds, config.min_gain, config.min_step,
+        config.damping, system.size < _WORTH_SHARING)

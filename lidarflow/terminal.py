@@ -1,0 +1,42 @@
+"""What all commands of the command line share: the console, a spinner, and the check for a viewer."""
+
+import sys
+
+
+def console(file):
+    """A rich console on `file`, which shows names of files as they are, not taken for markup or emoji."""
+    from rich.console import Console
+
+    return Console(file=file, markup=False, emoji=False, highlight=False)
+
+
+def show(table) -> None:
+    """Write a table to standard output."""
+    console(sys.stdout).print(table)
+
+
+def working(what: str):
+    """A spinner on standard error while something long goes on."""
+    from rich.text import Text
+
+    return console(sys.stderr).status(Text(what))
+
+
+def progress(what: str, total: int):
+    """A progress bar of `total` steps on standard error, a context manager; its one task is number 0."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    on = console(sys.stderr)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
+               TimeElapsedColumn())
+    bar = Progress(*columns, console=on, disable=not on.is_terminal)
+    bar.add_task(what, total=total)
+    return bar
+
+
+def check_live_view(wanted: bool) -> None:
+    """InstallError before any work where a viewer is wanted and none can be opened."""
+    if wanted:
+        from lidarflow import viewer
+
+        viewer.require_live_view()
