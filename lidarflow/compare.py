@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lidarflow import methods, metrics, runner
-from lidarflow.config import Config
+from lidarflow.config import Config, to_dict
 from lidarflow.datasets import Dataset
 from lidarflow.errors import ConfigError, LidarflowError
 from lidarflow.lidar import features
@@ -41,20 +41,20 @@ class MethodRun:
 class Comparison:
     """What every method made of the same pairs.
 
-    frames   names of the source scans
-    truth    what each pair was scored against
-    sigma_m  of crispness
+    frames  names of the source scans
+    truth   what each pair was scored against
+    config  the settings of all methods
     """
 
     runs: list[MethodRun]
     frames: list[str]
     truth: list[str]
-    sigma_m: float
+    config: Config
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
         return {
-            "crispness_sigma_m": self.sigma_m,
+            "config": to_dict(self.config),
             "frames": self.frames,
             "truth": self.truth,
             "methods": {
@@ -85,12 +85,12 @@ def compare(
     for _ in _pairs(dataset, frames[:2], [MethodRun(name) for name in names], config):
         pass
     runs = [MethodRun(name) for name in names]
-    found = Comparison(runs, [], [], config.crispness.sigma_m)
+    found = Comparison(runs, [], [], config)
     for index, pair, results in _pairs(dataset, frames, runs, config):
         truth, origin = runner.find_truth(dataset, index, pair)
         above_ground = _above_ground(pair.source, config)
         for run, result in zip(runs, results, strict=True):
-            run.figures.append(figures_of(pair, result, truth, above_ground, found.sigma_m))
+            run.figures.append(figures_of(pair, result, truth, above_ground, config.crispness.sigma_m))
         found.frames.append(pair.source.name)
         found.truth.append(origin)
         on_pair(pair.source.name)

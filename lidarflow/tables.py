@@ -92,7 +92,8 @@ def compare_notes(found: Comparison) -> list[str]:
     """What the figures of `compare_table` mean."""
     truth = ", ".join(dict.fromkeys(found.truth))
     notes = [f"pairs: {len(found.frames)}; means over pairs, time: median after one unmeasured pair",
-             f"crisp: crispness with σ = {found.sigma_m:g} m, 1 = aligned, of all points above ground"]
+             f"crisp: crispness with σ = {found.config.crispness.sigma_m:g} m, 1 = aligned, of all points "
+             "above ground"]
     if truth == "none":
         return ["truth: none found", *notes]
     return [f"truth: {truth}", *notes, "EPE: mean end-point error of all points with a known truth",

@@ -159,7 +159,8 @@ class SolveStats:
     """What the optimiser did; the same for every solver.
 
     Errors are energies: half the sum of squared (or truncated) residuals. `plain` is the step without the
-    robust kernel, `robust` the step with it. `stopped` counts components by reason of stopping.
+    robust kernel, `robust` the step with it. `stopped` counts components by reason of stopping. What a solver
+    does not tell is NaN, or 0 where it is counted.
     """
 
     solver: str

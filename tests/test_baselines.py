@@ -105,7 +105,8 @@ def test_every_point_has_the_one_motion(room, answers, name):
     assert_array_equal(result.valid, masks.usable)
     assert_array_equal(result.is_ground, masks.ground)
     assert not (result.is_dynamic.any() or result.in_graph.any()) and result.objects == ()
-    assert result.stats.solver == name and min(result.seconds.values()) > 0
+    assert result.stats.solver == name and result.stats.variables == (name != "zero")
+    assert min(result.seconds.values()) > 0
 
 
 def test_only_ransac_has_matches_and_says_how_many_agree(answers):

@@ -75,6 +75,7 @@ def test_compare_prints_a_row_per_method(lidarflow, kitti, tmp_path):
     assert [line.split()[0] for line in table[2:]] == ["ours", "zero", "icp", "ransac_icp", "ego"]
     assert "truth: flow" in out and "pairs: 2" in out
     written = json.loads((tmp_path / "all.json").read_text())
+    assert written["config"]["preparation"]["kitti_correction"] == "off"
     assert written["frames"] == ["000000", "000001"] and written["truth"] == ["flow", "flow"]
     assert set(written["methods"]) == {"ours", "zero", "icp", "ransac_icp", "ego"}
     mean = {name: found["mean"] for name, found in written["methods"].items()}
@@ -210,7 +211,8 @@ def test_an_error_keeps_its_kind(kitti, monkeypatch):
 def test_the_widest_comparison_fits_80_columns(monkeypatch, capsys):
     figures = {"crispness": 0.987, "epe_static_m": 12.345, "epe_dynamic_m": 12.345, "t_e_m": 12.345,
                "r_e_rad": 0.0123, "movers_found": 1.0, "false_movers": 0.0123}
-    found = compare.Comparison([compare.MethodRun("ransac_icp", [figures], [123.456])], ["0"], ["flow"], 0.2)
+    runs = [compare.MethodRun("ransac_icp", [figures], [123.456])]
+    found = compare.Comparison(runs, ["0"], ["flow"], Config())
     monkeypatch.setenv("COLUMNS", "80")
     cli._print(tables.compare_table(found))
     out = capsys.readouterr().out

@@ -41,6 +41,7 @@ class WholeScan(ABC):
     """
 
     name: ClassVar[str]
+    variables: ClassVar[int] = 1     # motions that are solved for
 
     def __init__(self, config: Config | None = None):
         self.config = config or Config()
@@ -98,9 +99,9 @@ class WholeScan(ABC):
         )
 
     def _stats(self, found: Registered) -> SolveStats:
-        """One variable, the motion; Open3D tells neither the iterations nor the energies of an ICP."""
+        """Open3D tells neither the iterations nor the energies of an ICP; those of RANSAC are its samples."""
         return SolveStats(
-            solver=self.name, variables=1, matches=len(found.match_source), edges=0, components=1,
-            solved_components=1, plain_iterations=0, robust_iterations=found.hypotheses,
-            plain_initial_error=_UNKNOWN, plain_final_error=_UNKNOWN, robust_initial_error=_UNKNOWN,
-            robust_final_error=_UNKNOWN, inliers=found.inliers, stopped={})
+            solver=self.name, variables=self.variables, matches=len(found.match_source), edges=0,
+            components=self.variables, solved_components=self.variables, plain_iterations=0,
+            robust_iterations=found.hypotheses, plain_initial_error=_UNKNOWN, plain_final_error=_UNKNOWN,
+            robust_initial_error=_UNKNOWN, robust_final_error=_UNKNOWN, inliers=found.inliers, stopped={})

@@ -8,6 +8,7 @@ class Zero(WholeScan):
     """Every point stays where it is in the sensor's frame."""
 
     name = "zero"
+    variables = 0
 
     def _register(self, pair, source, target) -> Registered:
         return Registered(pose.identity())
