@@ -20,8 +20,6 @@ CHUNK = 1040             # pixels; with a power of two all rows of a chunk would
 NEAREST_M = 0.01         # points this near to the camera, or behind it, are not seen
 _SUMS = 28               # 21 of the upper triangle of JᵀWJ, 6 of JᵀWr, 1 of rᵀWr
 _SMALLEST_MEAN = 1e-5    # keeps the robust scale positive where everything fits perfectly
-# Sums in any order, and no exception for a division by zero: without both, no loop uses vector registers.
-_VECTORISED = {"fastmath": {"reassoc", "nsz", "arcp", "contract"}, "error_model": "numpy"}
 
 
 @numba.njit(cache=True, inline="always")
@@ -138,7 +136,8 @@ def linearise(points, source, target, camera, motion, pixels, weights, noise, we
     return system, counts, best
 
 
-@numba.njit(cache=True, **_VECTORISED)
+# Sums stay in order: where they may be reordered, fresh code and code from the cache round differently.
+@numba.njit(cache=True, error_model="numpy")
 def _absolute_sum(equations, count, scale, twist):
     t = twist.astype(np.float32)
     row0, row1, row2, row3 = equations[0], equations[1], equations[2], equations[3]
@@ -150,7 +149,7 @@ def _absolute_sum(equations, count, scale, twist):
     return scale * total
 
 
-@numba.njit(cache=True, **_VECTORISED)
+@numba.njit(cache=True, error_model="numpy")
 def _normal_equations(equations, count, scale, twist, cauchy_sq, sums):
     """Add JᵀWJ, JᵀWr and rᵀWr of `count` equations to `sums`; W from the residuals at `twist`."""
     t = twist.astype(np.float32)
