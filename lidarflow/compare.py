@@ -28,9 +28,7 @@ class MethodRun:
 
     def mean(self) -> dict[str, float]:
         """Means over pairs; a figure leaves out pairs without a value, and is left out where all are."""
-        names = dict.fromkeys(name for row in self.figures for name in row)
-        values = {name: [row[name] for row in self.figures if np.isfinite(row[name])] for name in names}
-        return {name: float(np.mean(known)) for name, known in values.items() if known}
+        return {name: mean for name, (mean, _) in metrics.figures_over_frames(self.figures).items()}
 
     def median_seconds(self) -> float:
         """Median over pairs."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, pose, rgbd_io, rgbd_methods, rgbd_metrics, rgbd_preview
+from lidarflow import io, metrics, pose, rgbd_io, rgbd_methods, rgbd_metrics, rgbd_preview
 from lidarflow.datasets.rgbd_folders import RgbdFolder
 from lidarflow.errors import LidarflowError
 from lidarflow.rgbd_config import RgbdConfig
@@ -127,10 +127,8 @@ def metrics_of(run: RgbdRun) -> dict:
 
 def mean_of(reports: tuple[RgbdReport, ...]) -> dict[str, float]:
     """Means of the main figures over the pairs that have them."""
-    rows = [figures_of(report) for report in reports]
-    columns = {name: [row[name] for row in rows if np.isfinite(row.get(name, np.nan))]
-               for name in dict.fromkeys(name for row in rows for name in row)}
-    return {name: float(np.mean(values)) for name, values in columns.items() if values}
+    over_pairs = metrics.figures_over_frames(figures_of(report) for report in reports)
+    return {name: mean for name, (mean, _) in over_pairs.items()}
 
 
 def figures_of(report: RgbdReport) -> dict[str, float]:

@@ -148,10 +148,7 @@ def truth_of(reports: list[PairReport]) -> str:
 
 def _over_pairs(reports: list[PairReport]) -> dict[str, tuple[float, float]]:
     """Mean and standard deviation of every figure that some pair has a value of."""
-    rows = [figures_of(report) for report in reports]
-    names = dict.fromkeys(name for row in rows for name in row)
-    found = {name: metrics.over_frames(row[name] for row in rows if name in row) for name in names}
-    return {name: (mean, std) for name, (mean, std) in found.items() if np.isfinite(mean)}
+    return metrics.figures_over_frames(figures_of(report) for report in reports)
 
 
 def _plain_pair(report: PairReport) -> dict:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import Program, rests
 from PIL import Image
-from rgbd_worlds import FRAMES, QVGA, frames
+from rgbd_worlds import FRAMES, QVGA, copied, frames
 
 from lidarflow import config, demo, pose, rgbd, rgbd_io, rgbd_methods, synthetic
 from lidarflow.datasets.rgbd_folders import open_rgbd
@@ -277,19 +277,8 @@ def test_pairs_that_cannot_be_used(lidarflow, images, tmp_path):
     assert sorted(os.listdir(tmp_path)) == before
 
 
-def linked(folder, place):
-    """A TUM folder with the images of another; its lists can be changed."""
-    place.mkdir()
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            (place / entry.name).symlink_to(entry)
-        else:
-            (place / entry.name).write_bytes(entry.read_bytes())
-    return place
-
-
 def test_sequences_that_cannot_be_used(lidarflow, folder, tmp_path):
-    one, apart = linked(folder, tmp_path / "one"), linked(folder, tmp_path / "apart")
+    one, apart = copied(folder, tmp_path / "one"), copied(folder, tmp_path / "apart")
     (one / "rgb.txt").write_text("0.0 rgb/0.000000.png\n")
     (apart / "depth.txt").write_text("9.0 depth/0.000000.png\n9.1 depth/0.033333.png\n")
     (tmp_path / "empty").mkdir()
@@ -306,7 +295,7 @@ def test_sequences_that_cannot_be_used(lidarflow, folder, tmp_path):
 
 @pytest.mark.parametrize("bad", range(3))
 def test_a_damaged_frame_keeps_what_was_done_before(lidarflow, folder, tmp_path, bad):
-    place = linked(folder, tmp_path / "bad")
+    place = copied(folder, tmp_path / "bad")
     (place / "depth").unlink()
     (place / "depth").mkdir()
     for k, file in enumerate(sorted((folder / "depth").iterdir())):

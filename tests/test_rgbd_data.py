@@ -5,7 +5,7 @@ import os
 import numpy as np
 import pytest
 from PIL import Image
-from rgbd_worlds import QVGA, frames
+from rgbd_worlds import QVGA, copied, frames
 from shared_data import SHARED, needs_shared
 
 from lidarflow import pose, synthetic
@@ -35,17 +35,6 @@ def folder(tmp_path_factory):
     """Four rendered frames as a TUM folder."""
     place = tmp_path_factory.mktemp("tum") / "room"
     synthetic.write_tum(place, frames(), QVGA)
-    return place
-
-
-def copied(folder, place):
-    """A copy of a TUM folder's lists, its images linked."""
-    place.mkdir()
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            (place / entry.name).symlink_to(entry)
-        else:
-            (place / entry.name).write_bytes(entry.read_bytes())
     return place
 
 

@@ -94,9 +94,9 @@ def _expected(tracks: Tracks, ego_motion: np.ndarray) -> tuple[Expected, ...]:
     """What the tracks lead to expect, in the frame of the view: that of the target."""
     expected = []
     for track in tracks.followed:
-        over_ground = ego_motion @ track.over_ground @ pose.inverse(ego_motion)
         points = pose.apply(ego_motion, track.points)
-        expected.append(Expected(points, (pose.apply(over_ground, points) - points).mean(axis=0)))
+        moved = pose.apply(track.goes_on(ego_motion), points)
+        expected.append(Expected(points, (moved - points).mean(axis=0)))
     return tuple(expected)
 
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from lidarflow.config import ObjectsConfig
 from lidarflow.kernels import coherence
 from lidarflow.lidar.clusters import near_rows
-from lidarflow.lidar.surface import counterparts
+from lidarflow.lidar.surface import counterparts, plane_offsets
 from lidarflow.lidar.view import View
 
 _NEIGHBOURHOOD_M = 0.5   # evidence is weighed over this neighbourhood
@@ -74,7 +74,7 @@ def _shifted(view: View, config: ObjectsConfig) -> tuple[np.ndarray, np.ndarray]
     planes = np.full((len(rows), 3), np.nan)
     planes[agrees] = view.upright.normals[row[agrees]]
     offsets_m = np.full(len(rows), np.nan)
-    offsets_m[agrees] = (planes[agrees] * (view.upright.points[row[agrees]] - points[agrees])).sum(axis=1)
+    offsets_m[agrees] = plane_offsets(points[agrees], view.upright, row[agrees])
     shift, count, before_m, after_m = coherence.local_shifts(points, planes, offsets_m, _NEIGHBOURHOOD_M)
     explained = after_m**2 <= (1.0 - _MIN_COHERENCE) * before_m**2
     shifted = (count >= _MIN_PLANES) & (before_m >= _MIN_RMS_M) & explained

@@ -68,11 +68,15 @@ def counterparts(
     return row, distance_m, agrees
 
 
+def plane_offsets(points: np.ndarray, surface: Surface, row: np.ndarray) -> np.ndarray:
+    """How far (N,) along its normal, in metres, the plane at `row` (N,) lies from each point (N, 3)."""
+    return (surface.normals[row] * (surface.points[row] - points)).sum(axis=1)
+
+
 def misfit(points: np.ndarray, point_normals: np.ndarray, surface: Surface, tree: cKDTree) -> Misfit:
     """How far points (N, 3) with normals (N, 3) are from a surface."""
     row, distance_m, agrees = counterparts(points, point_normals, surface, tree, 2.0 * CAP_M)
     distance_m = np.minimum(distance_m, CAP_M)
     plane_m = distance_m.copy()
-    at = row[agrees]
-    plane_m[agrees] = np.abs((surface.normals[at] * (surface.points[at] - points[agrees])).sum(axis=1))
+    plane_m[agrees] = np.abs(plane_offsets(points[agrees], surface, row[agrees]))
     return Misfit(distance_m, np.minimum(plane_m, CAP_M))

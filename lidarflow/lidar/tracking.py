@@ -29,9 +29,13 @@ class Track:
     over_ground: np.ndarray
     missed: int = 0
 
+    def goes_on(self, ego_motion: np.ndarray) -> np.ndarray:
+        """Its motion over ground (4, 4) in the next pair, target frame, if it goes on as before."""
+        return ego_motion @ self.over_ground @ pose.inverse(ego_motion)
+
     def moved(self, ego_motion: np.ndarray) -> "Track":
         """The track one pair later, if it goes on as before."""
-        over_ground = ego_motion @ self.over_ground @ pose.inverse(ego_motion)
+        over_ground = self.goes_on(ego_motion)
         return replace(
             self, points=pose.apply(over_ground @ ego_motion, self.points), over_ground=over_ground,
             missed=self.missed + 1)

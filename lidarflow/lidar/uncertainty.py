@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from lidarflow import pose
 from lidarflow.kernels import grid
 from lidarflow.lidar.body import Body
-from lidarflow.lidar.surface import CAP_M, counterparts, nearest
+from lidarflow.lidar.surface import CAP_M, counterparts, nearest, plane_offsets
 from lidarflow.lidar.view import View
 from lidarflow.types import FlowProblem
 
@@ -51,8 +51,8 @@ def _planes(
     moved = pose.apply(over_ground, view.points[rows])
     turned = pose.turn(over_ground, view.source.normals[rows])
     row, _, agrees = counterparts(moved, turned, view.upright, view.upright_tree, CAP_M)
-    at, normals = moved[agrees], view.upright.normals[row[agrees]]
-    return at, normals, (normals * (view.upright.points[row[agrees]] - at)).sum(axis=1)
+    at, row = moved[agrees], row[agrees]
+    return at, view.upright.normals[row], plane_offsets(at, view.upright, row)
 
 
 def _ground(view: View) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,7 @@ from lidarflow.metrics.epe import (
     space_time_angle_error,
     summarise,
 )
-from lidarflow.metrics.paper import over_frames, pose_errors
+from lidarflow.metrics.paper import figures_over_frames, over_frames, pose_errors
 from lidarflow.metrics.ranges import Interval, by_range, by_speed, pooled_intervals
 from lidarflow.metrics.scores import POSES_ONLY, Pooled, Scores, figures, pool, score, static_truth
 from lidarflow.metrics.three_way import ThreeWay, evaluated, pooled_three_way, three_way
@@ -30,7 +30,7 @@ __all__ = [
     "POSES_ONLY", "Accuracy", "Alignment", "Bucketed", "Buckets", "ClassErrors", "ErrorSummary", "Interval",
     "MeanError", "Pooled", "Scores", "ThreeWay", "accuracy", "alignment", "angle_error", "bucketed",
     "buckets", "by_range", "by_speed", "crispness", "end_point_error", "error_over_speed", "evaluated",
-    "figures", "mean_error", "mean_of", "over_frames", "pool", "pooled", "pooled_buckets",
-    "pooled_intervals", "pooled_three_way", "pose_errors", "relative_error", "score",
+    "figures", "figures_over_frames", "mean_error", "mean_of", "over_frames", "pool", "pooled",
+    "pooled_buckets", "pooled_intervals", "pooled_three_way", "pose_errors", "relative_error", "score",
     "space_time_angle_error", "static_truth", "summarise", "three_way",
 ]

@@ -28,3 +28,11 @@ def over_frames(values: Iterable[float]) -> tuple[float, float]:
     """
     values = np.array([value for value in values if np.isfinite(value)])
     return (float(values.mean()), float(values.std())) if len(values) else (float("nan"), float("nan"))
+
+
+def figures_over_frames(rows: Iterable[dict[str, float]]) -> dict[str, tuple[float, float]]:
+    """Mean and standard deviation of every figure, by name, that some frame has; one row a frame."""
+    rows = list(rows)
+    names = dict.fromkeys(name for row in rows for name in row)
+    found = {name: over_frames(row[name] for row in rows if name in row) for name in names}
+    return {name: (mean, std) for name, (mean, std) in found.items() if np.isfinite(mean)}
