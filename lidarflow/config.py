@@ -110,6 +110,23 @@ class SolverConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class RefineConfig:
+    rounds: int = setting(
+        3, "how often near, small things are drawn to the next scan's surface; 0 = never", low=0)
+    max_size_m: float = setting(
+        2.5, "things larger than this, in any direction, have no limbs and stay as they are", low=0)
+    max_range_m: float = setting(
+        12.0, "things farther than this stay as they are: scan lines miss their limbs", low=0)
+    reach_m: float = setting(0.3, "a surface farther than this from a point does not draw it", low=0.01)
+    data_weight: float = setting(3.0, "weight of a squared distance to the surface in m²", low=1e-6)
+    tie_weight: float = setting(
+        1.0, "weight of a squared twist between a point and its object's, or the world's, motion", low=1e-6)
+    tie_truncation: float = setting(
+        0.03, "such a twist (metres and radians) beyond this lets the point go: limbs leave their body",
+        low=1e-3)
+
+
+@dataclass(frozen=True, slots=True)
 class EgoConfig:
     method: str = setting(
         "auto", "auto = KISS-ICP in a sequence, two-scan registration for a pair",
@@ -174,6 +191,7 @@ class Config:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
     ego: EgoConfig = field(default_factory=EgoConfig)
     dynamic: DynamicConfig = field(default_factory=DynamicConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)

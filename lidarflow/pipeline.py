@@ -9,7 +9,8 @@ import numpy as np
 from lidarflow import pose
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
-from lidarflow.lidar import dynamic, ego, features, frontend, mesh, preparation, start, uncertainty
+from lidarflow.lidar import dynamic, ego, features, frontend, mesh, preparation, refinement, start
+from lidarflow.lidar import uncertainty as uncertainties
 from lidarflow.lidar.attribution import WORLD, Attribution, attribute
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.solve import gtsam_lm
@@ -19,11 +20,12 @@ from lidarflow.types import FlowResult, Scan, ScanPair
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Previous:
-    """What one pair leaves for the next: its source points and result, its target's features, its tracks."""
+    """What one pair leaves for the next: source points and result, its target's features and mesh, tracks."""
 
     points: np.ndarray
     result: FlowResult
     target: features.Features
+    target_mesh: mesh.Mesh
     tracks: Tracks
 
 
@@ -63,7 +65,7 @@ class FlowEstimator:
         previous, self._previous = self._previous, None
         prepared = prepare(ScanPair(source, scan), self.config, previous, guess, timed)
         result, tracks = explain(prepared, self.config, previous.tracks if previous else Tracks())
-        self._previous = Previous(source.points, result, prepared.target, tracks)
+        self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh, tracks)
         return result
 
 
@@ -82,13 +84,14 @@ def run(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """A pair up to the question what moves: features, ego-motion, mesh, and the graph with its matches."""
+    """A pair up to the question what moves: features, ego-motion, meshes, and the graph with its matches."""
 
     pair: ScanPair
     source: features.Features
     target: features.Features
     ego_motion: np.ndarray
     mesh: mesh.Mesh
+    target_mesh: mesh.Mesh
     graph: frontend.Graph
     seconds: dict[str, float]
 
@@ -113,12 +116,17 @@ def prepare(
         ego_motion = ego.find(
             points[source.usable], pair.target.points[target.usable], ego_guess, config.ego)
     with timed("mesh"):
-        surface_mesh = mesh.build(
-            points, source.usable & ~source.ground, source.surface, config.mesh, config.normals.radius_m)
+        source_mesh = previous.target_mesh if previous else _mesh(pair.source, source, config)
+        target_mesh = _mesh(pair.target, target, config)
     with timed("matching"):
         start_motions = _start(points, previous, ego_motion, config)
-        graph = frontend.build_problem(pair, source, target, surface_mesh, start_motions, config)
-    return Prepared(pair, source, target, ego_motion, surface_mesh, graph, timed.seconds)
+        graph = frontend.build_problem(pair, source, target, source_mesh, start_motions, config)
+    return Prepared(pair, source, target, ego_motion, source_mesh, target_mesh, graph, timed.seconds)
+
+
+def _mesh(scan: Scan, seen: features.Features, config: Config) -> mesh.Mesh:
+    return mesh.build(
+        scan.points, seen.usable & ~seen.ground, seen.surface, config.mesh, config.normals.radius_m)
 
 
 def explain(prepared: Prepared, config: Config, tracks: Tracks) -> tuple[FlowResult, Tracks]:
@@ -133,51 +141,77 @@ def explain(prepared: Prepared, config: Config, tracks: Tracks) -> tuple[FlowRes
             matched = graph.rows[graph.problem.match_index], graph.problem.match_target
             found = attribute(pair, source, prepared.target, matched, ego_motion, tracks, config)
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
+        by_group = np.concatenate([found.motions, ego_motion[None]])[found.owner]   # WORLD is the last
     with timed("solver"):
         motions, solved, stats = gtsam_lm.solve(graph.problem, config.solver, config.graph.min_matches)
+    with timed("refinement"):
+        near_things, refined = _refined(prepared, _spread(by_group, graph, motions), found, config)
     with timed("dense answer"):
-        in_graph = graph.variable >= 0
-        is_solved = np.zeros(len(points), bool)
-        is_solved[in_graph] = solved[graph.variable[in_graph]]
-        on_object = found.owner != WORLD
-        dense = np.tile(ego_motion, (len(points), 1, 1))
-        dense[on_object] = found.motions[found.owner[on_object]]
-        dense[in_graph] = motions[graph.variable[in_graph]]
+        dense = _spread(_spread(by_group, graph, motions), near_things, refined)
         flow = pose.apply(dense, points) - points
-        is_dynamic = on_object
+        in_graph = (graph.variable >= 0) | (near_things.variable >= 0)
+        is_solved = near_things.variable >= 0
+        is_solved[graph.rows[solved[graph.variable[graph.rows]]]] = True
+        is_dynamic = found.owner != WORLD
         if not config.objects.enabled:
             residual_flow = flow - (pose.apply(ego_motion, points) - points)
             is_dynamic = dynamic.detect(
                 points, residual_flow, is_solved, prepared.mesh.edges, ego_motion,
                 pair.target.points[prepared.target.usable], pair.dt_s, config.dynamic)
         valid = source.ground | found.explained | is_solved
-        object_id = np.full(len(points), -1, np.int32)
-        object_id[on_object] = found.ids[found.owner[on_object]]
-        std_m = _std(points, found, graph, motions, solved, valid, flow, config)
+        object_id = np.append(found.ids, np.int32(-1))[found.owner]
+        std_m = _std(points, found, graph, motions, solved, flow, by_group, config)
+        std_m[~valid] = np.nan
     result = FlowResult(
         flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,
         object_id, found.objects, std_m)
     return result, found.tracks
 
 
+def _spread(dense: np.ndarray, graph: frontend.Graph, motions: np.ndarray) -> np.ndarray:
+    """Motions (N, 4, 4) of all points, those of the graph's variables (M, 4, 4) put in."""
+    rows = np.flatnonzero(graph.variable >= 0)
+    spread = dense.copy()
+    spread[rows] = motions[graph.variable[rows]]
+    return spread
+
+
+def _refined(
+    prepared: Prepared, dense: np.ndarray, found: Attribution, config: Config
+) -> tuple[frontend.Graph, np.ndarray]:
+    """The part of the graph that may have limbs, and its motions (M, 4, 4) on the next scan's surface."""
+    pair, target, limits = prepared.pair, prepared.target, config.refine
+    is_rigid = np.array([*(o.box_size.max() > limits.max_size_m for o in found.objects), False])
+    owner = frontend.owners(prepared.graph, found.owner)
+    kept = refinement.wanted(prepared.graph.problem, is_rigid[owner], limits)
+    part = frontend.tied(prepared.graph, kept, found.owner, found.motions, prepared.ego_motion)
+    motions = dense[part.rows]
+    if len(motions):
+        surface = refinement.Surface.around(
+            part.problem.points, pair.target.points, target.usable & ~target.ground, prepared.target_mesh)
+        solver = refinement.solver(config.solver, limits)
+        for _ in range(limits.rounds):
+            problem = refinement.rematched(part.problem, motions, surface, limits.reach_m)
+            motions, _, _ = gtsam_lm.solve(problem, solver, config.graph.min_matches)
+    return part, motions
+
+
 def _std(
     points: np.ndarray, found: Attribution, graph: frontend.Graph, motions: np.ndarray, solved: np.ndarray,
-    valid: np.ndarray, flow: np.ndarray, config: Config,
+    flow: np.ndarray, by_group: np.ndarray, config: Config,
 ) -> np.ndarray:
-    """Standard deviation (N,) of the flow in metres; NaN where the motion rests on no evidence.
+    """Standard deviation (N,) of the flow in metres.
 
-    A point of a group errs with the group's motion, and where the graph has moved it away from the group,
-    by that much more. Without groups, the matches around it tell.
+    A point of a group errs with the group's motion, and where it has been moved away from the group, by that
+    much more. Without groups, the matches around it tell.
     """
+    if config.objects.enabled:
+        apart_m = np.linalg.norm(pose.apply(by_group, points) - points - flow, axis=1)
+        return np.hypot(found.std_m, apart_m)
     std_m = found.std_m.copy()
     rows = graph.rows[solved]
-    if len(graph.problem.group):
-        by_group = graph.problem.group_motions[graph.problem.group[solved]]
-        apart_m = np.linalg.norm(pose.apply(by_group, points[rows]) - points[rows] - flow[rows], axis=1)
-        std_m[rows] = np.hypot(std_m[rows], apart_m)
-    elif len(rows):
-        std_m[rows] = uncertainty.of_matches(graph.problem, motions, config.solver.truncation_m)[solved]
-    std_m[~valid] = np.nan
+    if len(rows):
+        std_m[rows] = uncertainties.of_matches(graph.problem, motions, config.solver.truncation_m)[solved]
     return std_m
 
 

@@ -6,6 +6,7 @@ Every check takes a size, so that the same comparison also runs with compilation
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -289,6 +290,23 @@ def check_ring_strips(rings: int, columns: int) -> None:
         assert np.linalg.norm(points[opened[:, i]] - points[opened[:, j]], axis=1).max() <= 0.9
 
 
+def check_ring_edges(count: int) -> None:
+    points = rng(9).uniform(-1, 1, (count, 3)) + [6.0, 0.0, 0.0]
+    ring, wanted = rng(10).integers(0, 3, count), rng(11).random(count) < 0.5
+    order = np.lexsort((np.arctan2(points[:, 1], points[:, 0]), ring))
+    bounds = np.searchsorted(ring[order], np.arange(4))
+    found = mesh.ring_edges(points, order, bounds, wanted, 0.9, 0.0, 0.5, np.radians(10.0))
+    expected = []
+    for a, b in pairwise(order.tolist()):
+        step, reach = points[b] - points[a], np.linalg.norm(points[[a, b]], axis=1)
+        length, jump = np.linalg.norm(step), abs(reach[1] - reach[0])
+        across = np.sqrt(max(length**2 - jump**2, 0.0))
+        joined = length <= 0.9 and jump <= 0.5 and across >= np.sin(np.radians(10.0)) * length
+        if ring[a] == ring[b] and (wanted[a] or wanted[b]) and joined:
+            expected.append(sorted((a, b)))
+    np.testing.assert_array_equal(found, expected)
+
+
 def check_tangent_stars(count: int) -> None:
     points = bumpy_surface(count, rng(7))
     surface_normals = normals_twin(points, points, 0.5)
@@ -312,6 +330,7 @@ def check_all_tiny() -> None:
     check_shot(160, 4)
     check_matching(40)
     check_ring_strips(3, 60)
+    check_ring_edges(60)
     check_tangent_stars(150)
 
 
@@ -388,6 +407,10 @@ def test_best_in_gate():
 
 def test_ring_strips():
     check_ring_strips(6, 90)
+
+
+def test_ring_edges():
+    check_ring_edges(400)
 
 
 def test_tangent_stars():

@@ -97,7 +97,8 @@ def test_matches_and_stats_are_those_of_the_graph(car):
     assert all(row.tobytes() in target for row in result.match_target)
     assert stats.plain_final_error < stats.plain_initial_error
     assert stats.robust_final_error <= stats.robust_initial_error
-    stages = {"features", "ego-motion", "mesh", "matching", "objects", "solver", "dense answer"}
+    stages = {"features", "ego-motion", "mesh", "matching", "objects", "solver", "refinement",
+              "dense answer"}
     assert stages == set(result.seconds)
 
 

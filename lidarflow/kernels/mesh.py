@@ -68,6 +68,31 @@ def _ring_strips(points, azimuth, order, bounds, limits, triangles):
     return count
 
 
+def ring_edges(
+    points: np.ndarray, order: np.ndarray, bounds: np.ndarray, wanted: np.ndarray,
+    max_edge_m: float, max_edge_rad: float, max_depth_jump_m: float, min_grazing_rad: float,
+) -> np.ndarray:
+    """Edges (E, 2) int32, i < j, between neighbours on a ring where the surface is continuous.
+
+    `order` and `bounds` as for `ring_strips`; edges without a `wanted` (N,) end are left out.
+    """
+    limits = (max_edge_m, max_edge_rad, max_depth_jump_m, math.sin(min_grazing_rad))
+    return np.sort(_ring_edges(points, order, bounds, wanted, limits), axis=1)
+
+
+@numba.njit(cache=True)
+def _ring_edges(points, order, bounds, wanted, limits):
+    edges = np.empty((len(order), 2), np.int32)
+    count = 0
+    for ring in range(len(bounds) - 1):
+        for k in range(bounds[ring], bounds[ring + 1] - 1):
+            a, b = order[k], order[k + 1]
+            if (wanted[a] or wanted[b]) and continuous(points[a], points[b], limits):
+                edges[count, 0], edges[count, 1] = a, b
+                count += 1
+    return edges[:count].copy()
+
+
 @numba.njit(cache=True)
 def _next_on_ring(azimuth, order, start, here, end):
     """Point after position `here` of a ring and its azimuth; past the last the first one, a turn on.

@@ -65,17 +65,21 @@ def focused(
     object_id (N,), -1 = none; object_motions (G, 4, 4) and ego_motion (4, 4), target_from_source. Mesh
     components without a point on an object follow the ego-motion: ego-motion explains them.
     """
-    problem = graph.problem
-    rows = np.flatnonzero(graph.variable >= 0)
-    owner = np.full(len(problem.points), -1)
-    on_object = rows[object_id[rows] >= 0]
-    owner[graph.variable[on_object]] = object_id[on_object]
-    kept = np.isin(problem.component, problem.component[owner >= 0])
-    position = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
+    component = graph.problem.component
+    touched = np.isin(component, component[owners(graph, object_id) >= 0])
+    return tied(graph, touched, object_id, object_motions, ego_motion)
 
+
+def tied(
+    graph: Graph, kept: np.ndarray, object_id: np.ndarray, object_motions: np.ndarray,
+    ego_motion: np.ndarray,
+) -> Graph:
+    """The `kept` variables (M,) of a graph, whole components, each tied to its object or the world."""
+    problem = graph.problem
+    position = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
     match_kept = kept[problem.match_index]
     motions = np.concatenate([ego_motion[None], object_motions])
-    group = (owner[kept] + 1).astype(np.int32)   # group 0 is the static world
+    group = (owners(graph, object_id)[kept] + 1).astype(np.int32)   # group 0 is the static world
     _, component = np.unique(problem.component[kept], return_inverse=True)
     reduced = FlowProblem(
         points=problem.points[kept],
@@ -87,9 +91,18 @@ def focused(
         group=group,
         group_motions=motions,
     )
+    rows = np.flatnonzero(graph.variable >= 0)
     variable = np.full(len(graph.variable), -1, np.int32)
     variable[rows] = position[graph.variable[rows]]
     return Graph(reduced, variable, graph.rows[kept])
+
+
+def owners(graph: Graph, object_id: np.ndarray) -> np.ndarray:
+    """The object (M,) that a point of each variable is on, -1 = none, from that of the points (N,)."""
+    owner = np.full(len(graph.problem.points), -1)
+    on_object = np.flatnonzero((graph.variable >= 0) & (object_id >= 0))
+    owner[graph.variable[on_object]] = object_id[on_object]
+    return owner
 
 
 def _variables(points: np.ndarray, mesh: Mesh, thinning_m: float) -> tuple[np.ndarray, np.ndarray]:

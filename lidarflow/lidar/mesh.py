@@ -25,7 +25,7 @@ class Mesh:
     """Triangles over a cloud, as a graph.
 
     triangles  (T, 3) int32
-    edges      (E, 2) int32   unique, i < j, each the side of a triangle
+    edges      (E, 2) int32   unique, i < j: sides of triangles, and what a single ring sees of thin things
     component  (N,) int32     connected component of each point, 0 .. C-1; lone points are their own
     method     str            "grid" or "tangent": how the triangles were found
     """
@@ -56,6 +56,8 @@ def build(
     else:
         method, triangles = "grid", _grid_triangles(points, kept, ring, config)
     edges = unique_edges(triangles)
+    if ring is not None:
+        edges = _with_ring_edges(edges, points, kept, ring, config)
     return Mesh(triangles, edges, components(edges, len(points)), method)
 
 
@@ -66,7 +68,9 @@ def _grid_triangles(
 
     A branch in front of a wall breaks the wall's strips twice: along the ring, mended by strips that leave
     out the points no strip wanted, and across it, mended for the fragments by strips from every ring to the
-    next but one or two.
+    next but one or two. The wall breaks the strips of the branch likewise: where it is thin and slanting,
+    an arm held away from the body, it lies beside the wall on the next ring; what no strip wanted gets
+    strips by itself.
     """
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     rows = np.flatnonzero(kept & (ring >= 0))
@@ -74,7 +78,9 @@ def _grid_triangles(
     triangles = _strips(points, azimuth, rows, ring, limits)
     meshed = np.zeros(len(points), bool)
     meshed[triangles.ravel()] = True
-    triangles = np.concatenate([triangles, _strips(points, azimuth, rows[meshed[rows]], ring, limits)])
+    triangles = np.concatenate([
+        triangles, _strips(points, azimuth, rows[meshed[rows]], ring, limits),
+        _strips(points, azimuth, rows[~meshed[rows]], ring, limits)])
 
     component = components(unique_edges(triangles), len(points))
     is_fragment = np.bincount(component)[component] < _FRAGMENT_POINTS
@@ -84,6 +90,19 @@ def _grid_triangles(
     ]
     across = np.concatenate(across)
     return np.concatenate([triangles, across[is_fragment[across].any(axis=1)]])
+
+
+def _with_ring_edges(
+    edges: np.ndarray, points: np.ndarray, kept: np.ndarray, ring: np.ndarray, config: MeshConfig
+) -> np.ndarray:
+    """`edges` (E, 2) and those along rings to points without any: a level arm is seen by one ring only."""
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    rows = np.flatnonzero(kept & (ring >= 0))
+    order, bounds = _by_ring(azimuth, rows, ring)
+    lone = np.ones(len(points), bool)
+    lone[edges.ravel()] = False
+    along = kernel.ring_edges(points, order, bounds, lone, *_limits(config, max_edge_rad=0.0))
+    return np.unique(np.concatenate([edges, along]), axis=0)
 
 
 def _ring_spacing(points: np.ndarray, ring: np.ndarray) -> float:
@@ -99,9 +118,13 @@ def _ring_spacing(points: np.ndarray, ring: np.ndarray) -> float:
 def _strips(
     points: np.ndarray, azimuth: np.ndarray, rows: np.ndarray, ring: np.ndarray, limits: tuple
 ) -> np.ndarray:
+    return kernel.ring_strips(points, azimuth, *_by_ring(azimuth, rows, ring), *limits)
+
+
+def _by_ring(azimuth: np.ndarray, rows: np.ndarray, ring: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`rows` (P,) ring by ring with azimuth ascending, and where each ring begins in them (R + 1,)."""
     order = rows[np.lexsort((azimuth[rows], ring[rows]))]
-    bounds = np.searchsorted(ring[order], np.arange(ring.max() + 2))
-    return kernel.ring_strips(points, azimuth, order, bounds, *limits)
+    return order, np.searchsorted(ring[order], np.arange(ring.max() + 2))
 
 
 def _tangent_triangles(

@@ -1,0 +1,147 @@
+"""Refinement: limbs follow the next scan's surface where no single rigid motion does; what stands stays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import grid_edges
+
+from lidarflow import open3d_import, pose, synthetic
+from lidarflow.config import Config, RefineConfig, load
+from lidarflow.lidar import mesh, refinement
+from lidarflow.pipeline import estimate_flow
+from lidarflow.synthetic.human_motion import LIMBS
+from lidarflow.types import FlowProblem, ScanPair, Truth
+
+LEFT_FOREARM, RIGHT_FOREARM = LIMBS.index("left forearm"), LIMBS.index("right forearm")
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+# ---- which things -----------------------------------------------------------------------------------------
+
+def patches(*places_and_widths: tuple[float, float]) -> FlowProblem:
+    """Upright 4 x 4 patches of variables, (range in metres, width in metres) each, a component apiece."""
+    points, edges, component = [], [], []
+    for k, (range_m, width_m) in enumerate(places_and_widths):
+        y, z = np.meshgrid(np.linspace(0, width_m, 4), np.linspace(0, 1, 4))
+        points.append(np.column_stack([np.full(16, range_m), y.ravel(), z.ravel()]))
+        edges.append(grid_edges(4, 4) + 16 * k)
+        component.append(np.full(16, k, np.int32))
+    points = np.concatenate(points)
+    return FlowProblem(points, pose.identity(len(points)), np.empty(0, np.int32), np.empty((0, 3)),
+                       np.concatenate(edges).astype(np.int32), np.concatenate(component))
+
+
+def test_what_is_near_and_no_larger_than_a_person_is_refined():
+    problem = patches((8.0, 1.0), (8.0, 3.0), (13.0, 1.0), (8.0, 2.4))
+    kept = refinement.wanted(problem, np.zeros(64, bool), RefineConfig())
+    np.testing.assert_array_equal(kept, np.repeat([True, False, False, True], 16))
+
+
+def test_a_fragment_of_a_rigid_object_is_not_refined():
+    is_rigid = np.zeros(32, bool)
+    is_rigid[20] = True
+    kept = refinement.wanted(patches((8.0, 1.0), (9.0, 1.0)), is_rigid, RefineConfig())
+    np.testing.assert_array_equal(kept, np.repeat([True, False], 16))
+
+
+def test_no_rounds_refine_nothing_and_an_empty_graph_has_nothing_to_refine():
+    assert not refinement.wanted(patches((8.0, 1.0)), np.zeros(16, bool), RefineConfig(rounds=0)).any()
+    empty = FlowProblem(np.empty((0, 3)), np.empty((0, 4, 4)), np.empty(0, np.int32), np.empty((0, 3)),
+                        np.empty((0, 2), np.int32), np.empty(0, np.int32))
+    assert len(refinement.wanted(empty, np.zeros(0, bool), RefineConfig())) == 0
+
+
+# ---- where the surface is ---------------------------------------------------------------------------------
+
+def test_the_nearest_place_lies_within_a_triangle_and_else_on_a_point():
+    points = np.array([[5.0, 0.0, 0.0], [5.0, 1.0, 0.0], [5.0, 0.0, 1.0], [5.0, 3.0, 0.0], [5.0, 0.0, 9.0]])
+    one_triangle = mesh.Mesh(np.array([[0, 1, 2]], np.int32), np.array([[0, 1], [0, 2], [1, 2]], np.int32),
+                             np.array([0, 0, 0, 1, 2], np.int32), "grid")
+    kept = np.ones(5, bool)
+    surface = refinement.Surface.around(points[:4], points, kept, one_triangle)
+    asked = np.array([[5.2, 0.25, 0.25], [4.9, 2.9, 0.1], [5.1, -0.3, 0.5]])
+    np.testing.assert_allclose(
+        surface.nearest(asked), [[5.0, 0.25, 0.25], [5.0, 3.0, 0.0], [5.0, 0.0, 0.5]], atol=1e-6)
+    bare = refinement.Surface.around(points[:4], points, kept & (np.arange(5) != 1), one_triangle)
+    np.testing.assert_allclose(bare.nearest(asked[:1]), [[5.0, 0.0, 0.0]], atol=1e-6)
+
+
+def test_places_out_of_reach_say_nothing():
+    problem = patches((8.0, 1.0))
+    points = problem.points + [0.1, 0.0, 0.0]
+    points[problem.points[:, 2] > 0.9, 0] += 1.0
+    no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(16), "grid")
+    surface = refinement.Surface.around(problem.points, points, np.ones(16, bool), no_triangles)
+    matched = refinement.rematched(problem, problem.initial, surface, 0.3)
+    np.testing.assert_array_equal(matched.match_index, np.flatnonzero(problem.points[:, 2] < 0.9))
+    np.testing.assert_allclose(matched.match_target, points[matched.match_index])
+
+
+# ---- people -----------------------------------------------------------------------------------------------
+
+def person_pair(name: str, seed: int) -> tuple[ScanPair, Truth, np.ndarray]:
+    """Two scans 0.3 s apart of a person 7 m away, the truth, and the person's points in the second one."""
+    generator = rng(seed)
+    scene = synthetic.human_motion(name, generator, 7.0)
+    (source, truth), (target, next_truth), _ = synthetic.scan_sequence(
+        scene, synthetic.hdl32e(columns=2170), 3, generator, 0.3)
+    return ScanPair(source, target), truth, target.points[next_truth.object_id >= 0]
+
+
+def by_icp(points: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Flow (N, 3) of the best single motion that point-to-point ICP finds."""
+    o3d = open3d_import.open3d()
+    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud)) for cloud in (points, target)]
+    motion = np.eye(4)
+    for gate_m in (1.0, 0.5, 0.25):
+        motion = o3d.pipelines.registration.registration_icp(*clouds, gate_m, motion).transformation
+    return pose.apply(np.array(motion), points) - points
+
+
+@pytest.mark.parametrize("name", ["arms_up_down", "arms_backwards", "bend_sidewards", "bend_forward"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_moving_person_is_followed_better_than_by_one_motion_and_than_by_none(name, seed):
+    pair, truth, target = person_pair(name, seed)
+    person = truth.object_id >= 0
+    points, flow = pair.source.points[person], truth.flow[person]
+
+    def error_m(found: np.ndarray) -> float:
+        return float(np.linalg.norm(found - flow, axis=1).mean())
+
+    ours = error_m(estimate_flow(pair).flow[person])
+    assert ours < error_m(by_icp(points, target))
+    assert ours < max(0.8 * error_m(np.zeros_like(flow)), 0.01)
+
+
+def test_one_arm_is_followed_upwards_and_the_other_downwards():
+    pair, truth, _ = person_pair("arms_up_down", 0)
+    flow = estimate_flow(pair).flow
+    for limb, sign in ((LEFT_FOREARM, 1.0), (RIGHT_FOREARM, -1.0)):
+        on_limb = truth.object_id == limb
+        assert on_limb.sum() >= 8
+        true, found = truth.flow[on_limb].mean(axis=0), flow[on_limb].mean(axis=0)
+        assert sign * true[2] > 0.1 and sign * found[2] > 0.6 * abs(true[2])
+        assert np.linalg.norm(flow[on_limb] - truth.flow[on_limb], axis=1).mean() < 0.1
+    legs = truth.object_id == LIMBS.index("legs")
+    assert np.linalg.norm(flow[legs], axis=1).mean() < 0.01
+
+
+def test_a_room_stays_as_it_is():
+    """Refinement may move nothing that stands: noise is not a limb."""
+    scans = synthetic.scan_sequence(synthetic.room(rng(3)), synthetic.hdl64e(400), 2, rng(4))
+    pair, truth = ScanPair(scans[0][0], scans[1][0]), scans[0][1]
+    by_rounds = [estimate_flow(pair, load(overrides=(f"refine.rounds={n}",))) for n in (0, 3)]
+    assert by_rounds[1].in_graph.sum() > by_rounds[0].in_graph.sum() + 500
+    error_m = [np.linalg.norm(r.flow - truth.flow, axis=1)[truth.valid].mean() for r in by_rounds]
+    assert error_m[1] < error_m[0] + 0.003
+
+
+def test_the_solver_keeps_its_other_settings():
+    config = replace(Config().solver, smoothness_weight=7.0)
+    limits = RefineConfig(data_weight=2.0, reach_m=0.2)
+    found = refinement.solver(config, limits)
+    assert (found.smoothness_weight, found.data_weight, found.truncation_m) == (7.0, 2.0, 0.2)
