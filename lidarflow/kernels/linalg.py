@@ -49,22 +49,52 @@ def symmetric_eigen3(a00, a01, a02, a11, a12, a22, values, vectors):
                     vectors[k, j], vectors[k, j + 1] = vectors[k, j + 1], vectors[k, j]
 
 
+@numba.njit(cache=True, inline="always")
+def moved(point, motion):
+    """Where a motion (3, 4) or (4, 4) takes a point (3,): x, y, z in metres."""
+    x, y, z = point[0], point[1], point[2]
+    return (motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * z + motion[0, 3],
+            motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * z + motion[1, 3],
+            motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * z + motion[2, 3])
+
+
+@numba.njit(cache=True, inline="always")
+def turned(vector, motion):
+    """Where the rotation of a motion (3, 4) or (4, 4) takes a direction (3,): x, y, z."""
+    x, y, z = vector[0], vector[1], vector[2]
+    return (motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * z,
+            motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * z,
+            motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * z)
+
+
 @numba.njit(cache=True)
 def solve_positive6(matrix, right):
     """Solve matrix x = right, positive definite (6, 6); x replaces right (6,), and matrix is overwritten."""
-    for j in range(6):
+    _solve_positive(matrix, right, 6)
+
+
+@numba.njit(cache=True)
+def solve_positive4(matrix, right):
+    """Solve matrix x = right, positive definite (4, 4); x replaces right (4,), and matrix is overwritten."""
+    _solve_positive(matrix, right, 4)
+
+
+@numba.njit(cache=True, inline="always")
+def _solve_positive(matrix, right, size):
+    """By Cholesky's factors."""
+    for j in range(size):
         for k in range(j):
             matrix[j, j] -= matrix[j, k] * matrix[j, k]
         matrix[j, j] = math.sqrt(matrix[j, j])
-        for i in range(j + 1, 6):
+        for i in range(j + 1, size):
             for k in range(j):
                 matrix[i, j] -= matrix[i, k] * matrix[j, k]
             matrix[i, j] /= matrix[j, j]
-    for i in range(6):
+    for i in range(size):
         for k in range(i):
             right[i] -= matrix[i, k] * right[k]
         right[i] /= matrix[i, i]
-    for i in range(5, -1, -1):
-        for k in range(i + 1, 6):
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
             right[i] -= matrix[k, i] * right[k]
         right[i] /= matrix[i, i]

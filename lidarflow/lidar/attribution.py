@@ -6,13 +6,14 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import Config
+from lidarflow.kernels import tree
 from lidarflow.lidar import objects, tracking, uncertainty
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
 from lidarflow.lidar.features import Features
 from lidarflow.lidar.hypotheses import Expected
 from lidarflow.lidar.tracking import Tracks
-from lidarflow.lidar.view import View
+from lidarflow.lidar.view import Cloud, View
 from lidarflow.types import MovingObject, ScanPair
 
 WORLD = -1
@@ -81,13 +82,14 @@ def _view(
     pair: ScanPair, source: Features, target: Features, rows: np.ndarray,
     matches: tuple[np.ndarray, np.ndarray], ego_motion: np.ndarray, config: Config,
 ) -> View:
-    points = pair.source.points
+    points, places = pair.source.points, pair.target.points
     at = np.full(len(points), -1)
     at[rows] = np.arange(len(rows))
     return view_of_pair.look(
-        pose.apply(ego_motion, points[rows]), pair.target.points[target.usable],
-        target.ground[target.usable], pose.apply(ego_motion, points[source.usable]),
-        source.ground[source.usable], (at[matches[0]], matches[1]), config.normals.radius_m, config.objects)
+        Cloud(pose.apply(ego_motion, points[rows]),
+              pose.apply(ego_motion, points[source.usable & source.ground])),
+        Cloud(places[target.usable & ~target.ground], places[target.usable & target.ground]),
+        (at[matches[0]], matches[1]), config.normals.radius_m, config.objects)
 
 
 def _expected(tracks: Tracks, ego_motion: np.ndarray) -> tuple[Expected, ...]:
@@ -96,7 +98,7 @@ def _expected(tracks: Tracks, ego_motion: np.ndarray) -> tuple[Expected, ...]:
     for track in tracks.followed:
         points = pose.apply(ego_motion, track.points)
         moved = pose.apply(track.goes_on(ego_motion), points)
-        expected.append(Expected(points, (moved - points).mean(axis=0)))
+        expected.append(Expected(tree.build(points), (moved - points).mean(axis=0)))
     return tuple(expected)
 
 
