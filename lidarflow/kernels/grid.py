@@ -99,9 +99,20 @@ def lower_bound(keys, key):
 @numba.njit(cache=True)
 def runs(query, keys, lower, shape, cell_m, starts, ends):
     """Fill the up to nine runs [start, end) of sorted points around `query` (3,); returns how many."""
-    ix = int(np.floor((query[0] - lower[0]) / cell_m))
-    iy = int(np.floor((query[1] - lower[1]) / cell_m))
-    iz = int(np.floor((query[2] - lower[2]) / cell_m))
+    return runs_around(cell_of(query, lower, cell_m), keys, shape, starts, ends)
+
+
+@numba.njit(cache=True, inline="always")
+def cell_of(query, lower, cell_m):
+    """Indices of the cell of `query` (3,), which may lie outside the grid."""
+    return (math.floor((query[0] - lower[0]) / cell_m), math.floor((query[1] - lower[1]) / cell_m),
+            math.floor((query[2] - lower[2]) / cell_m))
+
+
+@numba.njit(cache=True)
+def runs_around(cell, keys, shape, starts, ends):
+    """As `runs`, for all queries in one cell."""
+    ix, iy, iz = cell
     count = 0
     z_low, z_high = max(iz - 1, 0), min(iz + 1, shape[2] - 1)
     if z_low > z_high:

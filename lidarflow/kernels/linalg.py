@@ -74,6 +74,12 @@ def solve_positive6(matrix, right):
 
 
 @numba.njit(cache=True)
+def solve_positive3(matrix, right):
+    """Solve matrix x = right, positive definite (3, 3); x replaces right (3,), and matrix is overwritten."""
+    _solve_positive(matrix, right, 3)
+
+
+@numba.njit(cache=True)
 def solve_positive4(matrix, right):
     """Solve matrix x = right, positive definite (4, 4); x replaces right (4,), and matrix is overwritten."""
     _solve_positive(matrix, right, 4)
