@@ -69,6 +69,18 @@ def check_tree(count: int) -> None:
         np.testing.assert_array_equal(tree.near_rows(built, tree.build(body), radius_m), expected)
 
 
+def check_moved_tree(count: int) -> None:
+    points, motion = clumps(count, 28), some_motion(29)
+    there = pose.apply(motion, points)
+    found = tree.moved(tree.build(points), there)
+    np.testing.assert_array_equal(found.points, there[found.rows])
+    for start, end, low, high in zip(found.starts, found.ends, found.low, found.high, strict=True):
+        np.testing.assert_array_equal(low, found.points[start:end].min(axis=0))
+        np.testing.assert_array_equal(high, found.points[start:end].max(axis=0))
+    distance_m, row = tree.query(found, there, 0.1)
+    assert (distance_m == 0.0).all() and (there[row] == there).all()
+
+
 def check_empty_tree() -> None:
     nothing, points = tree.build(np.empty((0, 3))), np.ones((2, 3))
     for mine, given in zip(nothing, tree.NOTHING, strict=True):
@@ -301,6 +313,7 @@ def check_solve_positive4(count: int) -> None:
 def check_all_tiny() -> None:
     """Every comparison on tiny inputs, for interpreted kernels."""
     check_tree(60)
+    check_moved_tree(60)
     check_empty_tree()
     check_voxel_numbers(40)
     check_links(60)
@@ -318,6 +331,11 @@ def test_tree():
     check_tree(700)
     check_tree(1500)           # more queries than one thread takes at a time
     check_empty_tree()
+
+
+def test_a_moved_tree():
+    check_moved_tree(700)
+    assert len(tree.moved(tree.NOTHING, np.empty((0, 3))).points) == 0
 
 
 def test_a_tree_of_many_equal_points():

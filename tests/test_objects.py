@@ -15,8 +15,7 @@ from lidarflow.lidar import acceptance, evidence, frontend, objects, rigid_fit
 from lidarflow.lidar import body as body_of
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
-from lidarflow.lidar.surface import Surface
-from lidarflow.lidar.view import Cloud
+from lidarflow.lidar.surface import Cloud, Surface
 from lidarflow.pipeline import FlowEstimator, estimate_flow, run
 from lidarflow.types import FlowProblem, ScanPair
 
@@ -58,6 +57,10 @@ def test_a_rigid_fit_without_counterparts_keeps_its_start():
     far = tree.build(np.array([[90.0, 0, 0]]))
     found, = rigid_fit.onto([box_surface(50, 3)], [(0, np.array([0.3, 0.2, 0.1]))], far)
     np.testing.assert_allclose(found, pose.from_translation([0.3, 0.2, 0.1]), atol=1e-12)
+
+
+def cloud(upright: np.ndarray, ground: np.ndarray, normal_radius_m: float) -> Cloud:
+    return Cloud(Surface.of(upright, 0.12, normal_radius_m), tree.build(ground))
 
 
 def wall(x: float, seed: int) -> np.ndarray:
@@ -144,8 +147,8 @@ def test_the_ground_tells_which_way_a_fit_may_go():
     front = wall(9.5, 7)[:600] * [1.0, 0.25, 0.1] + [0.0, 0.0, 0.6]
     body = np.concatenate([hood, front])
     truth = pose.from_translation([0.5, 0.0, 0.0])
-    target = Surface.of(pose.apply(truth, body) + rng(8).normal(0, 0.004, body.shape), 0.5)
-    source = Surface.of(body, 0.5)
+    target = Surface.of(pose.apply(truth, body) + rng(8).normal(0, 0.004, body.shape), 0.12, 0.5)
+    source = Surface.of(body, 0.12, 0.5)
     found = rigid_fit.onto_planes(
         source.points, source.normals, target, pose.from_translation([0.35, 0, 0.05]),
         np.array([0.0, 0.0, 1.0]), 1.0)
@@ -160,7 +163,7 @@ def rings_on_hood(shift_m: float) -> np.ndarray:
 
 
 def test_planes_are_not_carried_along_by_rings():
-    source, target = Surface.of(rings_on_hood(0.0), 0.6), Surface.of(rings_on_hood(0.2), 0.6)
+    source, target = Surface.of(rings_on_hood(0.0), 0.12, 0.6), Surface.of(rings_on_hood(0.2), 0.12, 0.6)
     by_points, = rigid_fit.onto([source.points], [(0, np.array([0.1, 0.0, 0.0]))], target.tree)
     by_planes = rigid_fit.onto_planes(
         source.points, source.normals, target, pose.from_translation([0.1, 0.0, 0.0]),
@@ -184,7 +187,7 @@ def scene(car_shift: np.ndarray, seed: int, wall_shift: np.ndarray = (0.0, 0.0, 
     ground = np.column_stack([random.uniform(2, 16, 4000), random.uniform(-6, 6, 4000), np.full(4000, -0.8)])
     matched = np.arange(0, len(source), 20)
     moved = source[matched] + np.where(source[matched, :1] < 13.0, car_shift, wall_shift)
-    return view_of_pair.look(Cloud(source, ground), Cloud(target, ground), (matched, moved), 0.5, CONFIG)
+    return view_of_pair.look(cloud(source, ground, 0.5), cloud(target, ground, 0.5), (matched, moved), CONFIG)
 
 
 @pytest.mark.parametrize("shift_m", [0.08, 0.15, 0.6, 1.4])
@@ -225,7 +228,7 @@ def test_what_the_surroundings_do_too_is_not_a_body():
     matched = np.arange(0, len(source), 10)
     nothing = np.empty((0, 3))
     view = view_of_pair.look(
-        Cloud(source, nothing), Cloud(target, nothing), (matched, source[matched] + shift), 0.4, CONFIG)
+        cloud(source, nothing, 0.4), cloud(target, nothing, 0.4), (matched, source[matched] + shift), CONFIG)
     part = np.flatnonzero(np.abs(view.points[:, 0] - 12.0) < 0.8)
     body = Body(part, pose.from_translation(shift))
     assert acceptance._surroundings_gain(view, body, shift)

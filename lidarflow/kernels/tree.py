@@ -47,6 +47,12 @@ def build(points: np.ndarray) -> Tree:
     return Tree(*_build(np.ascontiguousarray(points, float), levels))
 
 
+def moved(tree: Tree, points: np.ndarray) -> Tree:
+    """The tree of the same rows once they have moved together to `points` (N, 3); boxes are made anew."""
+    placed, low, high = _moved(tree, np.ascontiguousarray(points))
+    return tree._replace(points=placed, low=low, high=high)
+
+
 def query(tree: Tree, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Distance (N,) from each of points (N, 3) to the nearest of the tree, and its row (N,).
 
@@ -106,6 +112,25 @@ def _build(points, levels):
         starts[2 * node + 1], ends[2 * node + 1] = start, middle
         starts[2 * node + 2], ends[2 * node + 2] = middle, end
     return placed, rows, starts, ends, low, high
+
+
+@numba.njit(cache=True)
+def _moved(tree, points):
+    nodes = len(tree.ends)
+    placed = np.empty_like(points)
+    low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
+    for node in range(nodes - 1, -1, -1):
+        if node >= nodes // 2:
+            for i in range(tree.starts[node], tree.ends[node]):
+                for k in range(3):
+                    placed[i, k] = points[tree.rows[i], k]
+                    low[node, k] = min(low[node, k], placed[i, k])
+                    high[node, k] = max(high[node, k], placed[i, k])
+        else:
+            for k in range(3):
+                low[node, k] = min(low[2 * node + 1, k], low[2 * node + 2, k])
+                high[node, k] = max(high[2 * node + 1, k], high[2 * node + 2, k])
+    return placed, low, high
 
 
 @numba.njit(cache=True)

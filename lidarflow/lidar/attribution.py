@@ -13,7 +13,7 @@ from lidarflow.lidar.body import Body
 from lidarflow.lidar.features import Features
 from lidarflow.lidar.hypotheses import Expected
 from lidarflow.lidar.tracking import Tracks
-from lidarflow.lidar.view import Cloud, View
+from lidarflow.lidar.view import View
 from lidarflow.types import MovingObject, ScanPair
 
 WORLD = -1
@@ -57,7 +57,7 @@ def attribute(
     """
     points = pair.source.points
     rows = np.flatnonzero(source.usable & ~source.ground)
-    view = _view(pair, source, target, rows, matches, ego_motion, config)
+    view = _view(source, target, rows, matches, ego_motion, config)
     bodies = objects.find(view, pair.dt_s, config.objects, _expected(tracks, ego_motion))
 
     owner, explained = np.full(len(points), WORLD), np.zeros(len(points), bool)
@@ -79,17 +79,13 @@ def attribute(
 
 
 def _view(
-    pair: ScanPair, source: Features, target: Features, rows: np.ndarray,
-    matches: tuple[np.ndarray, np.ndarray], ego_motion: np.ndarray, config: Config,
+    source: Features, target: Features, rows: np.ndarray, matches: tuple[np.ndarray, np.ndarray],
+    ego_motion: np.ndarray, config: Config,
 ) -> View:
-    points, places = pair.source.points, pair.target.points
-    at = np.full(len(points), -1)
+    at = np.full(len(source.usable), -1)
     at[rows] = np.arange(len(rows))
-    return view_of_pair.look(
-        Cloud(pose.apply(ego_motion, points[rows]),
-              pose.apply(ego_motion, points[source.usable & source.ground])),
-        Cloud(places[target.usable & ~target.ground], places[target.usable & target.ground]),
-        (at[matches[0]], matches[1]), config.normals.radius_m, config.objects)
+    moved = source.cloud.moved(ego_motion, config.shot.surface_voxel_m, config.normals.radius_m)
+    return view_of_pair.look(moved, target.cloud, (at[matches[0]], matches[1]), config.objects)
 
 
 def _expected(tracks: Tracks, ego_motion: np.ndarray) -> tuple[Expected, ...]:

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidarflow import pose
 from lidarflow.kernels import grid, normals, tree
 from lidarflow.kernels import misfit as kernel
 from lidarflow.kernels.tree import Tree
 
 CAP_M = 0.3             # a point farther off than this is simply not explained
 MIN_AGREEMENT = 0.7     # |cosine| between the normals of a point and of its counterpart
-_VOXEL_M = 0.12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,11 +29,39 @@ class Surface:
     tree: Tree
 
     @classmethod
-    def of(cls, points: np.ndarray, radius_m: float) -> "Surface":
-        """The surface of points (N, 3), normals fitted within `radius_m`."""
-        thinned = grid.first_per_voxel(points, _VOXEL_M)
-        return cls(
-            points, normals.estimate(points, points[thinned], radius_m), thinned, tree.build(points))
+    def of(cls, points: np.ndarray, voxel_m: float, radius_m: float) -> "Surface":
+        """The surface of points (N, 3), normals fitted within `radius_m` to those thinned to `voxel_m`.
+
+        A voxel of 0 thins nothing.
+        """
+        thinned, fitted = _fitted(points, voxel_m, radius_m)
+        return cls(points, fitted, thinned, tree.build(points))
+
+    def moved(self, motion: np.ndarray, voxel_m: float, radius_m: float) -> "Surface":
+        """The surface of the same points after a motion (4, 4), thinned and fitted anew."""
+        points = pose.apply(motion, self.points)
+        thinned, fitted = _fitted(points, voxel_m, radius_m)
+        return Surface(points, fitted, thinned, tree.moved(self.tree, points))
+
+
+def _fitted(points: np.ndarray, voxel_m: float, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (S,) of the thinned points (N, 3), and normals (N, 3) fitted to them."""
+    thinned = grid.first_per_voxel(points, voxel_m) if voxel_m else np.arange(len(points))
+    return thinned, normals.estimate(points, points[thinned], radius_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """The points of a scan that take part: what stands upright, and a tree over the ground (G, 3)."""
+
+    upright: Surface
+    ground: Tree
+
+    def moved(self, motion: np.ndarray, voxel_m: float, radius_m: float) -> "Cloud":
+        """The cloud after a motion (4, 4), its surface thinned and fitted anew."""
+        ground = np.empty_like(self.ground.points)
+        ground[self.ground.rows] = pose.apply(motion, self.ground.points)
+        return Cloud(self.upright.moved(motion, voxel_m, radius_m), tree.moved(self.ground, ground))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,17 +12,9 @@ from lidarflow.config import ObjectsConfig
 from lidarflow.kernels import tree
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.evidence import Evidence, gather, tolerance
-from lidarflow.lidar.surface import CAP_M, Counterparts, Misfit, Surface, counterparts, misfit_after
+from lidarflow.lidar.surface import CAP_M, Cloud, Counterparts, Misfit, Surface, counterparts, misfit_after
 
 _STANDS_OUT_M = 2.0 * CAP_M   # planes are looked for up to here
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
-    """A scan's points, metres: what stands upright (N, 3), and the ground (G, 3)."""
-
-    upright: np.ndarray
-    ground: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,31 +60,28 @@ class View:
 
 
 def look(
-    source: Cloud, target: Cloud, matched: tuple[np.ndarray, np.ndarray], normal_radius_m: float,
-    config: ObjectsConfig,
+    source: Cloud, target: Cloud, matched: tuple[np.ndarray, np.ndarray], config: ObjectsConfig
 ) -> View:
     """The view of a pair, all in the target's sensor frame after ego-motion.
 
     matched: rows (K,) of the source's upright points and their matches (K, 3).
     """
-    points, rows = source.upright, matched[0]
-    surface, upright = Surface.of(points, normal_radius_m), Surface.of(target.upright, normal_radius_m)
-    ground, source_ground = tree.build(target.ground), tree.build(source.ground)
-
+    points, upright, rows = source.upright.points, target.upright, matched[0]
     farthest_m = float(tolerance(np.linalg.norm(points, axis=1), config).max(initial=_STANDS_OUT_M))
-    at_rest = counterparts(points, surface.normals, upright, farthest_m)
-    from_ground_m, _ = tree.query(ground, points, farthest_m)
+    at_rest = counterparts(points, source.upright.normals, upright, farthest_m)
+    from_ground_m, _ = tree.query(target.ground, points, farthest_m)
     left_m = np.minimum(at_rest.distance_m, from_ground_m)
     capped_m = np.minimum(left_m, CAP_M)
     on_plane = at_rest.within(_STANDS_OUT_M)
     plane_m = np.where(on_plane, np.minimum(np.abs(at_rest.offset_m), capped_m), capped_m)
 
     near_m = tolerance(np.linalg.norm(upright.points, axis=1), config)
-    was_there = tree.any_within(surface.tree, upright.points, near_m)
+    was_there = tree.any_within(source.upright.tree, upright.points, near_m)
     gone = np.flatnonzero(~was_there)
-    was_there[gone] = tree.any_within(source_ground, upright.points[gone], near_m[gone])
+    was_there[gone] = tree.any_within(source.ground, upright.points[gone], near_m[gone])
     newcomers = upright.points[~was_there]
+    everything = np.concatenate([upright.points, target.ground.points])
     return View(
-        surface, gather(points, left_m, np.concatenate([target.upright, target.ground]), config),
-        Misfit(capped_m, plane_m), at_rest, upright, ground, source_ground, ~was_there,
-        newcomers, tree.build(newcomers), tree.build(points[rows]), rows, matched[1] - points[rows])
+        source.upright, gather(points, left_m, everything, config), Misfit(capped_m, plane_m), at_rest,
+        upright, target.ground, source.ground, ~was_there, newcomers, tree.build(newcomers),
+        tree.build(points[rows]), rows, matched[1] - points[rows])
