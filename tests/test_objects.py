@@ -73,7 +73,8 @@ def test_evidence_tells_what_is_gone_from_what_is_out_of_view():
     still, gone, beside = wall(10.0, 1), np.array([[6.0, 0.0, 0.0]]), np.array([[0.0, 10.0, 0.0]])
     points, other = np.concatenate([gone, beside, still]), wall(10.0, 2)
     left_m, _ = cKDTree(other).query(points)
-    found = evidence.gather(points, left_m, other, CONFIG)
+    tolerance_m = evidence.tolerance(np.linalg.norm(points, axis=1), CONFIG)
+    found = evidence.gather(points, left_m, tolerance_m, other)
     assert found.unexplained[0] and not found.blind[0], "the sensor looks through where it was"
     assert found.blind[1] and not found.unexplained[1], "nothing was looked at there"
     assert not found.blind[2:].any() and found.unexplained[2:].mean() < 0.05
@@ -240,7 +241,7 @@ def test_a_body_is_completed_by_what_it_surrounds_and_what_follows_it():
     rows = np.flatnonzero(view.points[:, 0] < 12.0)
     kept = rows[rng(15).random(len(rows)) < 0.7]
     whole = body_of.completed(
-        view, Body(kept, pose.from_translation([0.6, 0.0, 0.0])), np.ones(len(view.points), bool), CONFIG)
+        view, Body(kept, pose.from_translation([0.6, 0.0, 0.0])), np.ones(len(view.points), bool))
     assert len(whole.rows) > 0.98 * len(rows) and np.isin(whole.rows, rows).all()
 
 

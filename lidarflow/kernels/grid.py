@@ -31,11 +31,12 @@ def voxels(points: np.ndarray, voxel_m: float) -> tuple[np.ndarray, np.ndarray]:
 
     Voxels are numbered in the order they first appear in points (N, 3).
     """
-    return _voxels(np.ascontiguousarray(points), float(voxel_m))
+    return numbered(np.ascontiguousarray(points), float(voxel_m))
 
 
 @numba.njit(cache=True)
-def _voxels(points, voxel_m):
+def numbered(points, voxel_m):
+    """As `voxels`, for other kernels."""
     slots = 16
     while slots < 2 * len(points):
         slots *= 2
@@ -71,7 +72,7 @@ def _hash(x, y, z):
 
 @numba.njit(cache=True)
 def _first_per_voxel(points, voxel_m):
-    number, counts = _voxels(points, voxel_m)
+    number, counts = numbered(points, voxel_m)
     first, least_sq = np.empty(len(counts), np.int64), np.full(len(counts), np.inf)
     for i in range(len(points)):
         off_sq = 0.0

@@ -16,6 +16,7 @@ MAX_TURN_RAD = 0.15
 MIN_TURNING_POINTS = 16      # fewer points do not fix a turn
 MIN_POINTS = 4
 _SETTLED = 1e-4              # a round that changes less, in metres and radians, ends its gate
+_ROUNDING_M = 1e-9           # distances are taken as equal up to this
 _REGULARISATION = 1e-6       # share of all weight that directions nothing holds are held back by
 
 
@@ -37,7 +38,7 @@ def _onto_points(points, target, translation, gates_m, rounds_per_gate, motion):
     centre = _mean(points)
     count = len(points)
     turn, shift = 0.0, translation.copy()
-    place = np.full(count, -1)
+    place, asked, clear_m = np.full(count, -1), np.zeros((count, 3)), np.full(count, -np.inf)
     for gate_m in gates_m:
         for _ in range(rounds_per_gate):
             cosine, sine = math.cos(turn), math.sin(turn)
@@ -47,10 +48,11 @@ def _onto_points(points, target, translation, gates_m, rounds_per_gate, motion):
                 ax, ay, az = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
                 x = cosine * ax - sine * ay + centre[0] + shift[0]
                 y = sine * ax + cosine * ay + centre[1] + shift[1]
-                place[i], _ = _again(target, x, y, az + centre[2] + shift[2], gate_m, place[i])
-                if place[i] < 0:
+                z = az + centre[2] + shift[2]
+                near, _ = _follow(target, x, y, z, gate_m, i, place, asked, clear_m)
+                if near < 0:
                     continue
-                at = target.points[place[i]]
+                at = target.points[near]
                 bx, by = at[0] - centre[0], at[1] - centre[1]
                 paired += 1
                 a[0], a[1], a[2] = a[0] + ax, a[1] + ay, a[2] + az
@@ -88,14 +90,15 @@ def onto_planes(
     """
     centre = _mean(points)
     shift = shift.copy()
-    place = np.full(len(points), -1)
+    place, asked = np.full(len(points), -1), np.zeros((len(points), 3))
+    clear_m = np.full(len(points), -np.inf)
     matrix, right = np.empty((4, 4)), np.empty(4)
     for gate_m in gates_m:
         matrix[:] = 0.0
         right[:] = 0.0
         total, count = _add_pairs(
             points, normals, target, target_normals, centre, turn, shift, gate_m, plane_scale_m,
-            point_scale_m, point_weight, min_agreement, place, matrix, right)
+            point_scale_m, point_weight, min_agreement, place, asked, clear_m, matrix, right)
         if count < MIN_POINTS:
             break
         held = along_ground * total
@@ -122,7 +125,7 @@ def onto_planes(
 @numba.njit(cache=True)
 def _add_pairs(
     points, normals, target, target_normals, centre, turn, shift, gate_m, plane_scale_m, point_scale_m,
-    point_weight, min_agreement, place, matrix, right,
+    point_weight, min_agreement, place, asked, clear_m, matrix, right,
 ):
     """Add the pairs' share to the lower triangle of the normal equations; returns weight and number."""
     cosine, sine = math.cos(turn), math.sin(turn)
@@ -131,11 +134,11 @@ def _add_pairs(
         dx, dy, dz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         tx, ty = cosine * dx - sine * dy, sine * dx + cosine * dy
         x, y, z = tx + centre[0] + shift[0], ty + centre[1] + shift[1], dz + centre[2] + shift[2]
-        place[i], apart_sq = _again(target, x, y, z, gate_m, place[i])
-        if place[i] < 0:
+        near, apart_sq = _follow(target, x, y, z, gate_m, i, place, asked, clear_m)
+        if near < 0:
             continue
         count += 1
-        at = target.points[place[i]]
+        at = target.points[near]
         ox, oy, oz = at[0] - x, at[1] - y, at[2] - z
         ratio = apart_sq / (point_scale_m * point_scale_m)
         weight = point_weight / ((1.0 + ratio) * (1.0 + ratio))
@@ -151,7 +154,7 @@ def _add_pairs(
         right[2] += weight * oy
         right[3] += weight * oz
 
-        plane = target_normals[target.rows[place[i]]]
+        plane = target_normals[target.rows[near]]
         nx, ny = cosine * normals[i, 0] - sine * normals[i, 1], sine * normals[i, 0] + cosine * normals[i, 1]
         if not agree(plane, nx, ny, normals[i, 2], min_agreement):
             continue
@@ -170,18 +173,22 @@ def _add_pairs(
     return total, count
 
 
-@numba.njit(cache=True, inline="always")
-def _again(target, x, y, z, gate_m, last):
-    """Nearest place within the gate and its squared distance, where `last` was nearest a round ago, or -1.
+@numba.njit(cache=True)
+def _follow(target, x, y, z, gate_m, i, place, asked, clear_m):
+    """Nearest place to x, y, z within the gate, -1 without one, and its squared distance, for point i.
 
-    It bounds the search: the nearest hardly changes.
+    place (N,) was nearest when the point was at asked (N, 3), and nothing else was within clear_m (N,). While
+    a point has moved by less than what sets the two apart, none is searched for.
     """
-    bound_sq = gate_m * gate_m
-    if last >= 0:
-        last_sq = trees.distance_sq(target.points, last, x, y, z)
-        if last_sq < bound_sq:
-            return trees.nearest(target, x, y, z, last_sq, last)
-    return trees.nearest(target, x, y, z, bound_sq, -1)
+    left_m = math.sqrt(trees.distance_sq(asked, i, x, y, z))
+    apart_sq = np.inf
+    if place[i] >= 0:
+        apart_sq = trees.distance_sq(target.points, place[i], x, y, z)
+    if min(math.sqrt(apart_sq), gate_m) >= clear_m[i] - left_m - _ROUNDING_M:
+        place[i], apart_sq, second_sq = trees.nearest_two(target, x, y, z, gate_m * gate_m)
+        clear_m[i] = math.sqrt(second_sq)
+        asked[i, 0], asked[i, 1], asked[i, 2] = x, y, z
+    return (place[i] if apart_sq < gate_m * gate_m else -1), apart_sq
 
 
 @numba.njit(cache=True)

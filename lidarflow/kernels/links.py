@@ -1,5 +1,7 @@
 """Single linkage of points, by union and find."""
 
+import math
+
 import numba
 import numpy as np
 
@@ -15,27 +17,48 @@ def components(points: np.ndarray, link_m: float) -> np.ndarray:
     Points are first gathered in cells of a third of that distance, whose means are then linked. Labels count
     from 0 in the order of the components' lowest cells.
     """
-    if len(points) == 0:
-        return np.empty(0, np.int64)
-    cell_m = link_m / _CELLS_PER_LINK
-    member, counts = grid.voxels(points, cell_m)
-    means, first = _means(np.ascontiguousarray(points), member, counts)
-    cells = np.floor(points[first] / cell_m).astype(np.int64)
-    order = np.lexsort(cells.T[::-1])
-    return _linked(means[order], trees.build(means[order]), float(link_m))[np.argsort(order)][member]
+    return _components(np.ascontiguousarray(points), float(link_m))
 
 
 @numba.njit(cache=True)
-def _means(points, member, counts):
-    """Mean (V, 3) of each cell, and the first point (V,) in it."""
-    means, first = np.zeros((len(counts), 3)), np.full(len(counts), -1)
+def _components(points, link_m):
+    member, means, place = _cells(points, link_m / _CELLS_PER_LINK)
+    label = _linked(means, trees.grown(means), link_m)
+    of_point = np.empty(len(points), np.int64)
     for i in range(len(points)):
-        means[member[i]] += points[i]
-        if first[member[i]] < 0:
-            first[member[i]] = i
-    for cell in range(len(counts)):
-        means[cell] /= counts[cell]
-    return means, first
+        of_point[i] = label[place[member[i]]]
+    return of_point
+
+
+@numba.njit(cache=True)
+def _cells(points, cell_m):
+    """Cell (N,) of each point, means (V, 3) of cells from the lowest on, and the place (V,) of each there."""
+    member, counts = grid.numbered(points, cell_m)
+    count = len(counts)
+    sums, cells = np.zeros((count, 3)), np.empty((count, 3), np.int64)
+    for i in range(len(points)):
+        for k in range(3):
+            sums[member[i], k] += points[i, k]
+            cells[member[i], k] = math.floor(points[i, k] / cell_m)
+    keys = np.zeros(count, np.int64)
+    for k in range(3):
+        lowest, highest = _least_and_most(cells[:, k])
+        for cell in range(count):
+            keys[cell] = keys[cell] * (highest - lowest + 1) + cells[cell, k] - lowest
+    means, place = np.empty((count, 3)), np.empty(count, np.int64)
+    order = np.argsort(keys)
+    for rank in range(count):
+        means[rank] = sums[order[rank]] / counts[order[rank]]
+        place[order[rank]] = rank
+    return member, means, place
+
+
+@numba.njit(cache=True)
+def _least_and_most(values):
+    least = most = 0
+    for i in range(len(values)):
+        least, most = (values[i], values[i]) if i == 0 else (min(least, values[i]), max(most, values[i]))
+    return least, most
 
 
 @numba.njit(cache=True)

@@ -4,7 +4,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import grid
-from lidarflow.kernels.linalg import symmetric_eigen3
+from lidarflow.kernels.linalg import plane_eigen3
 
 _MIN_NEIGHBOURS = 4
 _CHUNK = 256         # points that one thread takes at a time
@@ -32,7 +32,7 @@ def _estimate(points, surface, keys, lower, shape, radius_m):
 @numba.njit(cache=True)
 def _estimate_some(points, surface, keys, lower, shape, radius_m, normals):
     starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
-    values, vectors = np.empty(3), np.empty((3, 3))
+    values, across = np.empty(3), np.empty(3)
     last, run_count = (0, 0, 0), 0
     for i in range(len(points)):
         # Points that follow one another are often in one cell.
@@ -40,11 +40,11 @@ def _estimate_some(points, surface, keys, lower, shape, radius_m, normals):
         if i == 0 or cell != last:
             last = cell
             run_count = grid.runs_around(cell, keys, shape, starts, ends)
-        _fit(points[i], surface, radius_m * radius_m, starts, ends, run_count, values, vectors, normals[i])
+        _fit(points[i], surface, radius_m * radius_m, starts, ends, run_count, values, across, normals[i])
 
 
 @numba.njit(cache=True)
-def _fit(p, surface, radius_sq, starts, ends, run_count, values, vectors, normal):
+def _fit(p, surface, radius_sq, starts, ends, run_count, values, across, normal):
     """Fill `normal` (3,) at p (3,) from the runs of the surface around it, if it has one."""
     count = 0
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -66,12 +66,10 @@ def _fit(p, surface, radius_sq, starts, ends, run_count, values, vectors, normal
     if count < _MIN_NEIGHBOURS:
         return
     mx, my, mz = sx / count, sy / count, sz / count
-    symmetric_eigen3(sxx / count - mx * mx, sxy / count - mx * my, sxz / count - mx * mz,
-                     syy / count - my * my, syz / count - my * mz, szz / count - mz * mz,
-                     values, vectors)
+    plane_eigen3(sxx / count - mx * mx, sxy / count - mx * my, sxz / count - mx * mz,
+                 syy / count - my * my, syz / count - my * mz, szz / count - mz * mz, values, across)
     if values[1] <= _MIN_SPREAD * values[2]:
         return
-    facing = vectors[0, 0] * p[0] + vectors[1, 0] * p[1] + vectors[2, 0] * p[2]
-    sign = -1.0 if facing > 0.0 else 1.0
+    sign = -1.0 if across[0] * p[0] + across[1] * p[1] + across[2] * p[2] > 0.0 else 1.0
     for k in range(3):
-        normal[k] = sign * vectors[k, 0]
+        normal[k] = sign * across[k]

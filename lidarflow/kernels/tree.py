@@ -41,10 +41,7 @@ NOTHING = Tree(
 
 def build(points: np.ndarray) -> Tree:
     """The tree over finite points (N, 3), which may be none."""
-    levels = 0
-    while len(points) > _LEAF << levels:
-        levels += 1
-    return Tree(*_build(np.ascontiguousarray(points, float), levels))
+    return grown(np.ascontiguousarray(points, float))
 
 
 def moved(tree: Tree, points: np.ndarray) -> Tree:
@@ -77,8 +74,9 @@ def counts_around(
     marks (N, F) bool are aligned with the rows the tree was built from.
     """
     counts = np.zeros((len(points), marks.shape[1]), np.int64)
+    before = _before(tree, marks)
     kernel = _counts_in_chunks if len(points) > CHUNK else _counts_around
-    kernel(tree, marks, np.ascontiguousarray(points), float(radius_m), counts)
+    kernel(tree, before, np.ascontiguousarray(points), float(radius_m), counts)
     return counts
 
 
@@ -88,8 +86,11 @@ def any_within(tree: Tree, points: np.ndarray, reach_m: np.ndarray) -> np.ndarra
 
 
 @numba.njit(cache=True)
-def _build(points, levels):
-    count, nodes = len(points), (2 << levels) - 1
+def grown(points):
+    """As `build`, for other kernels."""
+    count, nodes = len(points), 1
+    while count > _LEAF * (nodes + 1) // 2:
+        nodes = 2 * nodes + 1
     placed, rows = points.copy(), np.arange(count)
     starts, ends = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64)
     low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
@@ -111,7 +112,7 @@ def _build(points, levels):
         _part(placed, rows, axis, start, end, middle)
         starts[2 * node + 1], ends[2 * node + 1] = start, middle
         starts[2 * node + 2], ends[2 * node + 2] = middle, end
-    return placed, rows, starts, ends, low, high
+    return Tree(placed, rows, starts, ends, low, high)
 
 
 @numba.njit(cache=True)
@@ -210,6 +211,39 @@ def nearest(tree, x, y, z, best_sq, best):
             if apart_sq < best_sq:
                 best, best_sq = i, apart_sq
     return best, best_sq
+
+
+@numba.njit(cache=True)
+def nearest_two(tree, x, y, z, reach_sq):
+    """Place of the point nearest to x, y, z, its squared distance, and that of the second; none has place -1.
+
+    Distances are `reach_sq` where nothing is nearer.
+    """
+    leaves = len(tree.ends) // 2
+    best, best_sq, second_sq = -1, reach_sq, reach_sq
+    waiting, waiting_sq = np.empty(DEPTH, np.int64), np.empty(DEPTH)
+    waiting[0], waiting_sq[0], depth = 0, box_distance_sq(tree, 0, x, y, z), 1
+    while depth > 0:
+        depth -= 1
+        node, node_sq = waiting[depth], waiting_sq[depth]
+        while node < leaves and node_sq < second_sq:
+            left, right = 2 * node + 1, 2 * node + 2
+            left_sq, right_sq = box_distance_sq(tree, left, x, y, z), box_distance_sq(tree, right, x, y, z)
+            if left_sq > right_sq:
+                left, right, left_sq, right_sq = right, left, right_sq, left_sq
+            if right_sq < second_sq:
+                waiting[depth], waiting_sq[depth] = right, right_sq
+                depth += 1
+            node, node_sq = left, left_sq
+        if node_sq >= second_sq:
+            continue
+        for i in range(tree.starts[node], tree.ends[node]):
+            apart_sq = distance_sq(tree.points, i, x, y, z)
+            if apart_sq < best_sq:
+                best, best_sq, second_sq = i, apart_sq, best_sq
+            elif apart_sq < second_sq:
+                second_sq = apart_sq
+    return best, best_sq, second_sq
 
 
 @numba.njit(cache=True)
@@ -335,18 +369,45 @@ def _farthest_sq(tree, node, points, i):
     return apart_sq
 
 
+@numba.njit(cache=True)
+def _before(tree, marks):
+    """How many (N + 1, F) points in front of each place have each mark."""
+    before = np.zeros((len(marks) + 1, marks.shape[1]), np.int64)
+    for i in range(len(marks)):
+        for mark in range(marks.shape[1]):
+            before[i + 1, mark] = before[i, mark] + marks[tree.rows[i], mark]
+    return before
+
+
 @numba.njit(cache=True, parallel=True)
-def _counts_in_chunks(tree, marks, points, radius_m, counts):
+def _counts_in_chunks(tree, before, points, radius_m, counts):
     for chunk in numba.prange((len(points) + CHUNK - 1) // CHUNK):
         start, end = chunk * CHUNK, (chunk + 1) * CHUNK
-        _counts_around(tree, marks, points[start:end], radius_m, counts[start:end])
+        _counts_around(tree, before, points[start:end], radius_m, counts[start:end])
 
 
 @numba.njit(cache=True)
-def _counts_around(tree, marks, points, radius_m, counts):
-    found = np.empty(len(tree.rows), np.int64)
+def _counts_around(tree, before, points, radius_m, counts):
+    """Add the counts of marks (K, F) to `counts`; a node in reach as a whole is two look-ups in `before`."""
+    leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
+    waiting = np.empty(DEPTH, np.int64)
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        for i in range(all_within(tree, x, y, z, radius_m * radius_m, found)):
-            for mark in range(marks.shape[1]):
-                counts[k, mark] += marks[tree.rows[found[i]], mark]
+        waiting[0], depth = 0, 1
+        while depth > 0:
+            depth -= 1
+            node = waiting[depth]
+            if box_distance_sq(tree, node, x, y, z) > radius_sq:
+                continue
+            start, end = tree.starts[node], tree.ends[node]
+            if _farthest_sq(tree, node, points, k) <= radius_sq:
+                for mark in range(counts.shape[1]):
+                    counts[k, mark] += before[end, mark] - before[start, mark]
+            elif node < leaves:
+                waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2
+                depth += 2
+            else:
+                for i in range(start, end):
+                    if distance_sq(tree.points, i, x, y, z) <= radius_sq:
+                        for mark in range(counts.shape[1]):
+                            counts[k, mark] += before[i + 1, mark] - before[i, mark]

@@ -92,7 +92,9 @@ def _observability(view: View, body: Body, shift: np.ndarray) -> float:
 
 def _matches_agree(view: View, body: Body, shift: np.ndarray, config: ObjectsConfig) -> bool:
     """Whether the body's median descriptor match is nearer to its motion than to rest, along the ground."""
-    on_body = np.isin(view.match_rows, body.rows)
+    is_body = np.zeros(len(view.points), bool)
+    is_body[body.rows] = True
+    on_body = is_body[view.match_rows]
     if on_body.sum() < max(config.min_matches, 1):
         return config.min_matches == 0
     points, match_shift = view.points[view.match_rows[on_body]], view.match_shift[on_body]

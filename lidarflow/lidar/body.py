@@ -7,7 +7,6 @@ import numpy as np
 from lidarflow.config import ObjectsConfig
 from lidarflow.kernels import grid, ground_plane, links, tree
 from lidarflow.lidar import rigid_fit
-from lidarflow.lidar.evidence import tolerance
 from lidarflow.lidar.view import View
 
 _LINK_M = 0.5            # points of one body hang together at this distance
@@ -47,20 +46,26 @@ def grown(
     The side of a car that moves along itself is explained by either motion, and belongs to the car when
     the car's motion explains it about as well.
     """
+    is_seed, is_near = np.zeros((2, len(view.points)), bool)
+    is_seed[seed] = True
     near = near_rows(view, seed, _FIRST_REACH_M)
     body = None
     for _ in range(_GROWTH_ROUNDS):
         rows = near[free[near]]
-        rows = rows[_agrees(view, rows, over_ground, config)]
+        rows = rows[_agrees(view, rows, over_ground)]
         if len(rows) < config.min_points:
             return None
         label = links.components(view.points[rows], _LINK_M)
-        rows = rows[np.isin(label, label[np.isin(rows, seed)])]
+        holds_seed = np.zeros(len(rows), bool)   # by label
+        holds_seed[label[is_seed[rows]]] = True
+        rows = rows[holds_seed[label]]
         if len(rows) < config.min_points:
             return None
         over_ground = fitted(view, rows, over_ground, config)
         body = Body(rows, over_ground)
-        wider = np.union1d(near, near_rows(view, rows, _REACH_M))
+        is_near[near] = True
+        is_near[near_rows(view, rows, _REACH_M)] = True
+        wider = np.flatnonzero(is_near)
         if len(wider) == len(near):
             break
         near = wider
@@ -77,7 +82,7 @@ def fitted(view: View, rows: np.ndarray, start: np.ndarray, config: ObjectsConfi
         _ground_normal(view, points.mean(axis=0)), config.along_ground)
 
 
-def completed(view: View, body: Body, free: np.ndarray, config: ObjectsConfig) -> Body:
+def completed(view: View, body: Body, free: np.ndarray) -> Body:
     """The body with the points it surrounds and the fragments that follow it; `free` (N,) may be taken.
 
     A mesh or a linkage cuts a body at its glass and its edges; what lies amid its points or moves along
@@ -90,7 +95,7 @@ def completed(view: View, body: Body, free: np.ndarray, config: ObjectsConfig) -
     if len(near) == 0:
         return body
     after, by_ego = view.after(near, body.over_ground), view.by_ego.distance_m[near]
-    follows = (after.distance_m <= _tolerance_at(view, near, config))
+    follows = (after.distance_m <= view.tolerance_m[near])
     follows &= (after.distance_m < by_ego - _CLEARLY_BETTER_M) & view.evidence.unexplained[near]
     on_body[near[follows]] = True
     # Twice: what the first round adds surrounds others.
@@ -111,20 +116,16 @@ def _surrounded(view: View, on_body: np.ndarray, rows: np.ndarray) -> np.ndarray
     return of_body - on_body[rows] > others - ~on_body[rows]   # the point itself has no say
 
 
-def _agrees(view: View, rows: np.ndarray, over_ground: np.ndarray, config: ObjectsConfig) -> np.ndarray:
+def _agrees(view: View, rows: np.ndarray, over_ground: np.ndarray) -> np.ndarray:
     """Whether (K,) the motion explains the points at `rows` clearly better, or in place and about as well."""
     own = view.after(rows, over_ground)
     ego_m, ego_plane_m = view.by_ego.distance_m[rows], view.by_ego.plane_m[rows]
-    fits = own.distance_m <= _tolerance_at(view, rows, config)
+    fits = own.distance_m <= view.tolerance_m[rows]
     better = own.distance_m < ego_m - _CLEARLY_BETTER_M
     plane_better = fits & (own.plane_m < ego_plane_m - _AS_GOOD_M)
     as_good = fits & (own.distance_m < ego_m + _AS_GOOD_M) & (own.plane_m < ego_plane_m + _CLEARLY_BETTER_M)
     plane_worse = (own.plane_m > ego_plane_m + _AS_GOOD_M) & ~better
     return (better | plane_better | as_good) & ~plane_worse
-
-
-def _tolerance_at(view: View, rows: np.ndarray, config: ObjectsConfig) -> np.ndarray:
-    return tolerance(np.linalg.norm(view.points[rows], axis=1), config)
 
 
 def _ground_normal(view: View, centre: np.ndarray) -> np.ndarray:

@@ -26,14 +26,15 @@ class Evidence:
     blind: np.ndarray
 
 
-def gather(points: np.ndarray, left_m: np.ndarray, other: np.ndarray, config: ObjectsConfig) -> Evidence:
+def gather(
+    points: np.ndarray, left_m: np.ndarray, tolerance_m: np.ndarray, other: np.ndarray
+) -> Evidence:
     """Evidence of `points` (N, 3), which lie `left_m` (N,) from the nearest of `other` (M, 3).
 
-    Metres, both in the sensor frame of `other`.
+    They are explained up to `tolerance_m` (N,). Metres, both clouds in the sensor frame of `other`.
     """
-    range_m = np.linalg.norm(points, axis=1)
-    far = np.flatnonzero(left_m > tolerance(range_m, config))
-    towards = points[far] / np.maximum(range_m[far], 1e-6)[:, None]
+    far = np.flatnonzero(left_m > tolerance_m)
+    towards = points[far] / np.maximum(np.linalg.norm(points[far], axis=1), 1e-6)[:, None]
     seen = directions.looked_at(towards, other, _MAX_ANGLE_RAD, _MIN_DIRECTIONS)
     unexplained, blind = np.zeros((2, len(points)), bool)
     unexplained[far[seen]] = True

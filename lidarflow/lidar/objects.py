@@ -42,7 +42,7 @@ def find(
         grown = body.grown(view, found.rows[mine], start, free, config)
         if grown is None or not moves(view, grown, dt_s, config):
             continue
-        whole = body.completed(view, grown, free, config)
+        whole = body.completed(view, grown, free)
         # What a body surrounds must not speak against it.
         if moves(view, whole, dt_s, config):
             bodies.append(whole)

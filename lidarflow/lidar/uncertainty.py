@@ -93,9 +93,9 @@ def _std(
     x = moved - centre
     turns, both, shifts = covariance[:3, :3], covariance[:3, 3:], covariance[3:, 3:]
     axial = np.array([both[2, 1] - both[1, 2], both[0, 2] - both[2, 0], both[1, 0] - both[0, 1]])
-    by_turn_sq = np.trace(turns) * (x**2).sum(axis=1) - ((x @ turns) * x).sum(axis=1)
+    by_turn_sq = np.einsum("ni,ni->n", x @ (np.trace(turns) * np.eye(3) - turns), x)
     by_fit_sq = np.trace(shifts) + 2.0 * (x @ axial) + by_turn_sq
-    by_angle_sq = (_CALIBRATION_RAD**2) * (moved**2).sum(axis=1)
+    by_angle_sq = (_CALIBRATION_RAD**2) * np.einsum("ni,ni->n", moved, moved)
     return np.sqrt(by_fit_sq + _CALIBRATION_M**2 + by_angle_sq)
 
 

@@ -22,6 +22,7 @@ class View:
     """A pair of scans in the target's sensor frame.
 
     source         Surface       non-ground points (N, 3) of the source, after ego-motion
+    tolerance_m    (N,)          how far they may be from the target and still be explained
     evidence       Evidence      of these points against the whole target
     by_ego         Misfit        how far ego-motion leaves them from the target
     at_rest        Counterparts  their nearest of `upright`, within the reach of planes
@@ -37,6 +38,7 @@ class View:
     """
 
     source: Surface
+    tolerance_m: np.ndarray
     evidence: Evidence
     by_ego: Misfit
     at_rest: Counterparts
@@ -67,7 +69,8 @@ def look(
     matched: rows (K,) of the source's upright points and their matches (K, 3).
     """
     points, upright, rows = source.upright.points, target.upright, matched[0]
-    farthest_m = float(tolerance(np.linalg.norm(points, axis=1), config).max(initial=_STANDS_OUT_M))
+    tolerance_m = tolerance(np.linalg.norm(points, axis=1), config)
+    farthest_m = float(tolerance_m.max(initial=_STANDS_OUT_M))
     at_rest = counterparts(points, source.upright.normals, upright, farthest_m)
     from_ground_m, _ = tree.query(target.ground, points, farthest_m)
     left_m = np.minimum(at_rest.distance_m, from_ground_m)
@@ -82,6 +85,6 @@ def look(
     newcomers = upright.points[~was_there]
     everything = np.concatenate([upright.points, target.ground.points])
     return View(
-        source.upright, gather(points, left_m, everything, config), Misfit(capped_m, plane_m), at_rest,
-        upright, target.ground, source.ground, ~was_there, newcomers, tree.build(newcomers),
-        tree.build(points[rows]), rows, matched[1] - points[rows])
+        source.upright, tolerance_m, gather(points, left_m, tolerance_m, everything),
+        Misfit(capped_m, plane_m), at_rest, upright, target.ground, source.ground, ~was_there, newcomers,
+        tree.build(newcomers), tree.build(points[rows]), rows, matched[1] - points[rows])
