@@ -89,6 +89,18 @@ def check_eigen(count: int) -> None:
         np.testing.assert_allclose((vectors * values) @ vectors.T / size, m / size, atol=1e-12)
 
 
+def check_plane_eigen(count: int) -> None:
+    for m in symmetric_matrices(count):
+        values, normal = np.empty(3), np.empty(3)
+        linalg.plane_eigen3(m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2], values, normal)
+        size = np.abs(m).max() + 1e-300
+        expected = np.linalg.eigh(m)[0]
+        np.testing.assert_allclose(values / size, expected / size, atol=1e-7)
+        np.testing.assert_allclose(normal @ normal, 1.0, atol=1e-12)
+        if expected[1] - expected[0] > 0.01 * size:
+            np.testing.assert_allclose(m @ normal / size, expected[0] * normal / size, atol=1e-12)
+
+
 # ---- normals --------------------------------------------------------------------------------------------
 
 def normals_twin(points: np.ndarray, surface: np.ndarray, radius_m: float) -> np.ndarray:
@@ -325,6 +337,7 @@ def check_all_tiny() -> None:
     check_voxels(60)
     check_grid_queries(40)
     check_eigen(2)
+    check_plane_eigen(2)
     check_normals(120)
     check_local_shifts(80)
     check_shot(160, 4)
@@ -345,6 +358,10 @@ def test_grid_queries_see_every_neighbour_once():
 
 def test_symmetric_eigen3():
     check_eigen(60)
+
+
+def test_plane_eigen3():
+    check_plane_eigen(60)
 
 
 def test_normals():

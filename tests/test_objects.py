@@ -10,11 +10,12 @@ from shared_data import SHARED, needs_shared
 from lidarflow import pose, synthetic
 from lidarflow.config import ObjectsConfig
 from lidarflow.datasets import open_dataset
-from lidarflow.lidar import acceptance, clusters, evidence, frontend, objects, rigid_fit
+from lidarflow.kernels import links, tree
+from lidarflow.lidar import acceptance, evidence, frontend, objects, rigid_fit
 from lidarflow.lidar import body as body_of
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
-from lidarflow.lidar.surface import Surface
+from lidarflow.lidar.surface import Cloud, Surface
 from lidarflow.pipeline import FlowEstimator, estimate_flow, run
 from lidarflow.types import FlowProblem, ScanPair
 
@@ -36,10 +37,10 @@ def box_surface(count: int, seed: int) -> np.ndarray:
 
 def test_points_link_up_to_the_distance_and_not_beyond():
     row = np.column_stack([np.arange(0, 4, 0.1), np.zeros(40), np.zeros(40)])
-    label = clusters.linked(np.concatenate([row, row + [0, 1.5, 0]]), 0.5)
+    label = links.components(np.concatenate([row, row + [0, 1.5, 0]]), 0.5)
     assert len(np.unique(label[:40])) == len(np.unique(label[40:])) == 1
     assert label[0] != label[-1]
-    assert len(clusters.linked(np.empty((0, 3)), 0.5)) == 0
+    assert len(links.components(np.empty((0, 3)), 0.5)) == 0
 
 
 @pytest.mark.parametrize("turn", [-0.08, 0.0, 0.05])
@@ -47,14 +48,19 @@ def test_a_rigid_fit_finds_turn_and_shift(turn):
     truth = pose.from_translation([8.4, 3.1, 0.02]) @ pose.from_yaw(turn) @ pose.from_translation([-8, -3, 0])
     source = box_surface(800, 1) + [8.0, 3.0, 0.0]
     target = pose.apply(truth, box_surface(4000, 2) + [8.0, 3.0, 0.0])
-    found = rigid_fit.onto(source, cKDTree(target), np.array([0.3, 0.2, 0.0]))
+    found, = rigid_fit.onto([source], [(0, np.array([0.3, 0.2, 0.0]))], tree.build(target))
     off_m = (pose.apply(found, source) - pose.apply(truth, source))[:, :2]   # sides say nothing of height
     assert np.linalg.norm(off_m, axis=1).mean() < 0.01
 
 
 def test_a_rigid_fit_without_counterparts_keeps_its_start():
-    found = rigid_fit.onto(box_surface(50, 3), cKDTree([[90.0, 0, 0]]), np.array([0.3, 0.2, 0.1]))
+    far = tree.build(np.array([[90.0, 0, 0]]))
+    found, = rigid_fit.onto([box_surface(50, 3)], [(0, np.array([0.3, 0.2, 0.1]))], far)
     np.testing.assert_allclose(found, pose.from_translation([0.3, 0.2, 0.1]), atol=1e-12)
+
+
+def cloud(upright: np.ndarray, ground: np.ndarray, normal_radius_m: float) -> Cloud:
+    return Cloud(Surface.of(upright, 0.12, normal_radius_m), tree.build(ground))
 
 
 def wall(x: float, seed: int) -> np.ndarray:
@@ -65,11 +71,14 @@ def wall(x: float, seed: int) -> np.ndarray:
 
 def test_evidence_tells_what_is_gone_from_what_is_out_of_view():
     still, gone, beside = wall(10.0, 1), np.array([[6.0, 0.0, 0.0]]), np.array([[0.0, 10.0, 0.0]])
-    found = evidence.gather(np.concatenate([gone, beside, still]), wall(10.0, 2), CONFIG)
+    points, other = np.concatenate([gone, beside, still]), wall(10.0, 2)
+    left_m, _ = cKDTree(other).query(points)
+    tolerance_m = evidence.tolerance(np.linalg.norm(points, axis=1), CONFIG)
+    found = evidence.gather(points, left_m, tolerance_m, other)
     assert found.unexplained[0] and not found.blind[0], "the sensor looks through where it was"
     assert found.blind[1] and not found.unexplained[1], "nothing was looked at there"
     assert not found.blind[2:].any() and found.unexplained[2:].mean() < 0.05
-    assert (found.left_m[2:][~found.unexplained[2:]] <= evidence.tolerance(np.array(12.0), CONFIG)).all()
+    assert (left_m[2:][~found.unexplained[2:]] <= evidence.tolerance(np.array(12.0), CONFIG)).all()
 
 
 def test_an_object_is_described_along_its_way():
@@ -139,10 +148,10 @@ def test_the_ground_tells_which_way_a_fit_may_go():
     front = wall(9.5, 7)[:600] * [1.0, 0.25, 0.1] + [0.0, 0.0, 0.6]
     body = np.concatenate([hood, front])
     truth = pose.from_translation([0.5, 0.0, 0.0])
-    target = Surface.of(pose.apply(truth, body) + rng(8).normal(0, 0.004, body.shape), 0.5)
-    source = Surface.of(body, 0.5)
+    target = Surface.of(pose.apply(truth, body) + rng(8).normal(0, 0.004, body.shape), 0.12, 0.5)
+    source = Surface.of(body, 0.12, 0.5)
     found = rigid_fit.onto_planes(
-        source.points, source.normals, target, cKDTree(target.points), pose.from_translation([0.35, 0, 0.05]),
+        source.points, source.normals, target, pose.from_translation([0.35, 0, 0.05]),
         np.array([0.0, 0.0, 1.0]), 1.0)
     np.testing.assert_allclose(found[:3, 3], [0.5, 0.0, 0.0], atol=0.02)
 
@@ -155,11 +164,11 @@ def rings_on_hood(shift_m: float) -> np.ndarray:
 
 
 def test_planes_are_not_carried_along_by_rings():
-    source, target = Surface.of(rings_on_hood(0.0), 0.6), Surface.of(rings_on_hood(0.2), 0.6)
-    tree, up = cKDTree(target.points), np.array([0.0, 0.0, 1.0])
-    by_points = rigid_fit.onto(source.points, tree, np.array([0.1, 0.0, 0.0]))
+    source, target = Surface.of(rings_on_hood(0.0), 0.12, 0.6), Surface.of(rings_on_hood(0.2), 0.12, 0.6)
+    by_points, = rigid_fit.onto([source.points], [(0, np.array([0.1, 0.0, 0.0]))], target.tree)
     by_planes = rigid_fit.onto_planes(
-        source.points, source.normals, target, tree, pose.from_translation([0.1, 0.0, 0.0]), up, 1.0)
+        source.points, source.normals, target, pose.from_translation([0.1, 0.0, 0.0]),
+        np.array([0.0, 0.0, 1.0]), 1.0)
     moved = pose.apply(by_planes, source.points) - source.points
     np.testing.assert_allclose(moved.mean(axis=0), [0.2, 0.0, 0.0], atol=0.03)
     assert abs(by_points[0, 3] - 0.2) > 0.1, "nearest points follow the rings"
@@ -177,14 +186,9 @@ def scene(car_shift: np.ndarray, seed: int, wall_shift: np.ndarray = (0.0, 0.0, 
 
     source, target = returns(np.zeros(3), np.zeros(3)), returns(np.asarray(car_shift), np.asarray(wall_shift))
     ground = np.column_stack([random.uniform(2, 16, 4000), random.uniform(-6, 6, 4000), np.full(4000, -0.8)])
-    target = np.concatenate([target, ground])
-    on_ground = np.arange(len(target)) >= len(target) - len(ground)
     matched = np.arange(0, len(source), 20)
     moved = source[matched] + np.where(source[matched, :1] < 13.0, car_shift, wall_shift)
-    everything = np.concatenate([source, ground])
-    return view_of_pair.look(
-        source, target, on_ground, everything, np.arange(len(everything)) >= len(source), (matched, moved),
-        0.5, CONFIG)
+    return view_of_pair.look(cloud(source, ground, 0.5), cloud(target, ground, 0.5), (matched, moved), CONFIG)
 
 
 @pytest.mark.parametrize("shift_m", [0.08, 0.15, 0.6, 1.4])
@@ -223,12 +227,12 @@ def test_what_the_surroundings_do_too_is_not_a_body():
     source = box + random.normal(0, 0.004, box.shape)
     target = box_surface(6000, 19) * [3.0, 0.3, 2.0] + [12.0, 0.0, 0.0] + shift
     matched = np.arange(0, len(source), 10)
+    nothing = np.empty((0, 3))
     view = view_of_pair.look(
-        source, target, np.zeros(len(target), bool), source, np.zeros(len(source), bool),
-        (matched, source[matched] + shift), 0.4, CONFIG)
+        cloud(source, nothing, 0.4), cloud(target, nothing, 0.4), (matched, source[matched] + shift), CONFIG)
     part = np.flatnonzero(np.abs(view.points[:, 0] - 12.0) < 0.8)
     body = Body(part, pose.from_translation(shift))
-    assert acceptance._surroundings_gain(view, body, view.points[part], shift)
+    assert acceptance._surroundings_gain(view, body, shift)
     assert not acceptance.moves(view, body, 0.1, CONFIG)
 
 
@@ -237,7 +241,7 @@ def test_a_body_is_completed_by_what_it_surrounds_and_what_follows_it():
     rows = np.flatnonzero(view.points[:, 0] < 12.0)
     kept = rows[rng(15).random(len(rows)) < 0.7]
     whole = body_of.completed(
-        view, Body(kept, pose.from_translation([0.6, 0.0, 0.0])), np.ones(len(view.points), bool), CONFIG)
+        view, Body(kept, pose.from_translation([0.6, 0.0, 0.0])), np.ones(len(view.points), bool))
     assert len(whole.rows) > 0.98 * len(rows) and np.isin(whole.rows, rows).all()
 
 

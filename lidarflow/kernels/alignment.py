@@ -14,21 +14,12 @@ import math
 import numba
 import numpy as np
 
-from lidarflow.kernels.linalg import solve_positive6
+from lidarflow.kernels.linalg import moved, solve_positive6
 
 CHUNK = 1040             # pixels; with a power of two all rows of a chunk would share lines of the cache
 NEAREST_M = 0.01         # points this near to the camera, or behind it, are not seen
 _SUMS = 28               # 21 of the upper triangle of JᵀWJ, 6 of JᵀWr, 1 of rᵀWr
 _SMALLEST_MEAN = 1e-5    # keeps the robust scale positive where everything fits perfectly
-
-
-@numba.njit(cache=True, inline="always")
-def moved(point, motion):
-    """Where a motion (3, 4) takes a point (3,): x, y, z in metres."""
-    x, y, z = point[0], point[1], point[2]
-    return (motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * z + motion[0, 3],
-            motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * z + motion[1, 3],
-            motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * z + motion[2, 3])
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")

@@ -8,7 +8,8 @@ import math
 import numba
 import numpy as np
 
-from lidarflow.kernels.alignment import look_up, moved
+from lidarflow.kernels.alignment import look_up
+from lidarflow.kernels.linalg import moved
 
 _NEGLIGIBLE = 6.0   # exp(−6) = 0.0025: weights below it are 0
 

@@ -1,11 +1,15 @@
 """Local translation of a surface from signed plane distances: Lucas and Kanade's step, on points."""
 
+import math
+
 import numba
 import numpy as np
 
 from lidarflow.kernels import grid
+from lidarflow.kernels.linalg import solve_positive3
 
 _DAMPING = 0.02   # share of a full plane that an unseen direction is held back by
+_CHUNK = 256      # points that one thread takes at a time
 
 
 def local_shifts(
@@ -27,34 +31,54 @@ def local_shifts(
 @numba.njit(cache=True, parallel=True)
 def _local_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m):
     n = len(points)
-    shifts = np.zeros((n, 3))
-    counts = np.zeros(n, np.int64)
+    shifts, counts = np.zeros((n, 3)), np.zeros(n, np.int64)
     before_m, after_m = np.zeros(n), np.zeros(n)
-    for i in numba.prange(n):
-        starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
-        normal_matrix, right = np.zeros((3, 3)), np.zeros(3)
+    for chunk in numba.prange((n + _CHUNK - 1) // _CHUNK):
+        start, end = chunk * _CHUNK, (chunk + 1) * _CHUNK
+        _some_shifts(points[start:end], at, normals, offsets_m, keys, lower, shape, radius_m,
+                     shifts[start:end], counts[start:end], before_m[start:end], after_m[start:end])
+    return shifts, counts, before_m, after_m
+
+
+@numba.njit(cache=True)
+def _some_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m, shifts, counts, before_m,
+                 after_m):
+    starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
+    last, run_count = (0, 0, 0), 0
+    factor, t = np.empty((3, 3)), np.empty(3)
+    for i in range(len(points)):
+        # Points that follow one another are often in one cell.
+        cell = grid.cell_of(points[i], lower, radius_m)
+        if i == 0 or cell != last:
+            last = cell
+            run_count = grid.runs_around(cell, keys, shape, starts, ends)
         count, total_sq = 0, 0.0
-        for run in range(grid.runs(points[i], keys, lower, shape, radius_m, starts, ends)):
+        xx = xy = xz = yy = yz = zz = rx = ry = rz = 0.0
+        for run in range(run_count):
             for j in range(starts[run], ends[run]):
                 if _distance_sq(points[i], at[j]) > radius_m * radius_m:
                     continue
                 count += 1
-                total_sq += offsets_m[j] * offsets_m[j]
-                for a in range(3):
-                    right[a] += normals[j, a] * offsets_m[j]
-                    for b in range(3):
-                        normal_matrix[a, b] += normals[j, a] * normals[j, b]
+                r, nx, ny, nz = offsets_m[j], normals[j, 0], normals[j, 1], normals[j, 2]
+                total_sq += r * r
+                rx, ry, rz = rx + nx * r, ry + ny * r, rz + nz * r
+                xx, xy, xz = xx + nx * nx, xy + nx * ny, xz + nx * nz
+                yy, yz, zz = yy + ny * ny, yz + ny * nz, zz + nz * nz
         counts[i] = count
         if count == 0:
             continue
-        damped = normal_matrix + _DAMPING * count * np.eye(3)
-        t = np.linalg.solve(damped, right)
+        damping = _DAMPING * count
+        factor[0, 0], factor[1, 0], factor[2, 0] = xx + damping, xy, xz
+        factor[1, 1], factor[2, 1], factor[2, 2] = yy + damping, yz, zz + damping
+        t[0], t[1], t[2] = rx, ry, rz
+        solve_positive3(factor, t)
         # |r − n·t|² summed, from the sums at hand.
-        left_sq = total_sq - 2.0 * (right @ t) + t @ (normal_matrix @ t)
+        quadratic = (xx * t[0] * t[0] + yy * t[1] * t[1] + zz * t[2] * t[2]
+                     + 2.0 * (xy * t[0] * t[1] + xz * t[0] * t[2] + yz * t[1] * t[2]))
+        left_sq = total_sq - 2.0 * (rx * t[0] + ry * t[1] + rz * t[2]) + quadratic
         shifts[i] = t
-        before_m[i] = np.sqrt(total_sq / count)
-        after_m[i] = np.sqrt(max(left_sq, 0.0) / count)
-    return shifts, counts, before_m, after_m
+        before_m[i] = math.sqrt(total_sq / count)
+        after_m[i] = math.sqrt(max(left_sq, 0.0) / count)
 
 
 @numba.njit(cache=True)

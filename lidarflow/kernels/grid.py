@@ -4,6 +4,8 @@ Points are sorted by cell, z fastest, so that the cells above and below one anot
 run: a query reads nine runs.
 """
 
+import math
+
 import numba
 import numpy as np
 
@@ -21,17 +23,65 @@ def build(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray, np
 
 def first_per_voxel(points: np.ndarray, voxel_m: float) -> np.ndarray:
     """Indices (V,), ascending, of the point nearest to the centre of each occupied voxel; points (N, 3)."""
-    if len(points) == 0:
-        return np.empty(0, np.int64)
-    cells = np.floor(points / voxel_m)
-    off_centre_sq = ((points / voxel_m - cells - 0.5) ** 2).sum(axis=1)
-    cells = (cells - cells.min(axis=0)).astype(np.int64)
-    shape = cells.max(axis=0) + 1
-    keys = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
-    order = np.lexsort((off_centre_sq, keys))
-    first = np.ones(len(order), bool)
-    first[1:] = keys[order][1:] != keys[order][:-1]
-    return np.sort(order[first])
+    return np.sort(_first_per_voxel(np.ascontiguousarray(points), float(voxel_m)))
+
+
+def voxels(points: np.ndarray, voxel_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """The number (N,) of each point's voxel, and how many points each voxel has (V,).
+
+    Voxels are numbered in the order they first appear in points (N, 3).
+    """
+    return numbered(np.ascontiguousarray(points), float(voxel_m))
+
+
+@numba.njit(cache=True)
+def numbered(points, voxel_m):
+    """As `voxels`, for other kernels."""
+    slots = 16
+    while slots < 2 * len(points):
+        slots *= 2
+    table = np.full(slots, -1)                      # number of the voxel in each slot
+    cells = np.empty((len(points), 3), np.int64)    # of each voxel
+    number, counts = np.empty(len(points), np.int64), np.zeros(len(points), np.int64)
+    found = 0
+    for i in range(len(points)):
+        x = math.floor(points[i, 0] / voxel_m)
+        y = math.floor(points[i, 1] / voxel_m)
+        z = math.floor(points[i, 2] / voxel_m)
+        slot = _hash(x, y, z) & (slots - 1)
+        while table[slot] >= 0:
+            own = cells[table[slot]]
+            if own[0] == x and own[1] == y and own[2] == z:
+                break
+            slot = (slot + 1) & (slots - 1)
+        if table[slot] < 0:
+            table[slot] = found
+            cells[found, 0], cells[found, 1], cells[found, 2] = x, y, z
+            found += 1
+        number[i] = table[slot]
+        counts[number[i]] += 1
+    return number, counts[:found].copy()
+
+
+@numba.njit(cache=True, inline="always")
+def _hash(x, y, z):
+    """Large primes spread cells (Teschner et al. 2003); what is above is folded into the low bits."""
+    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
+    return mixed ^ (mixed >> 17)
+
+
+@numba.njit(cache=True)
+def _first_per_voxel(points, voxel_m):
+    number, counts = numbered(points, voxel_m)
+    first, least_sq = np.empty(len(counts), np.int64), np.full(len(counts), np.inf)
+    for i in range(len(points)):
+        off_sq = 0.0
+        for k in range(3):
+            place = points[i, k] / voxel_m
+            off_sq += (place - math.floor(place) - 0.5) ** 2
+        if off_sq < least_sq[number[i]]:
+            least_sq[number[i]], first[number[i]] = off_sq, i
+    return first
 
 
 @numba.njit(cache=True, inline="always")
@@ -50,9 +100,20 @@ def lower_bound(keys, key):
 @numba.njit(cache=True)
 def runs(query, keys, lower, shape, cell_m, starts, ends):
     """Fill the up to nine runs [start, end) of sorted points around `query` (3,); returns how many."""
-    ix = int(np.floor((query[0] - lower[0]) / cell_m))
-    iy = int(np.floor((query[1] - lower[1]) / cell_m))
-    iz = int(np.floor((query[2] - lower[2]) / cell_m))
+    return runs_around(cell_of(query, lower, cell_m), keys, shape, starts, ends)
+
+
+@numba.njit(cache=True, inline="always")
+def cell_of(query, lower, cell_m):
+    """Indices of the cell of `query` (3,), which may lie outside the grid."""
+    return (math.floor((query[0] - lower[0]) / cell_m), math.floor((query[1] - lower[1]) / cell_m),
+            math.floor((query[2] - lower[2]) / cell_m))
+
+
+@numba.njit(cache=True)
+def runs_around(cell, keys, shape, starts, ends):
+    """As `runs`, for all queries in one cell."""
+    ix, iy, iz = cell
     count = 0
     z_low, z_high = max(iz - 1, 0), min(iz + 1, shape[2] - 1)
     if z_low > z_high:

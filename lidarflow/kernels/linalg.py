@@ -50,21 +50,93 @@ def symmetric_eigen3(a00, a01, a02, a11, a12, a22, values, vectors):
 
 
 @numba.njit(cache=True)
+def plane_eigen3(a00, a01, a02, a11, a12, a22, values, normal):
+    """Eigenvalues (3,) ascending, and the unit eigenvector (3,) of the least, in closed form (Smith 1961).
+
+    As good as iterating where the least is apart from the others; where it is not, no direction means much.
+    """
+    mean = (a00 + a11 + a22) / 3.0
+    b00, b11, b22 = a00 - mean, a11 - mean, a22 - mean
+    spread = math.sqrt((b00 * b00 + b11 * b11 + b22 * b22 + 2.0 * (a01 * a01 + a02 * a02 + a12 * a12)) / 6.0)
+    values[0] = values[1] = values[2] = mean
+    normal[0], normal[1], normal[2] = 1.0, 0.0, 0.0
+    if spread == 0.0:
+        return
+    half_det = 0.5 * (b00 * (b11 * b22 - a12 * a12) - a01 * (a01 * b22 - a12 * a02)
+                      + a02 * (a01 * a12 - b11 * a02)) / (spread * spread * spread)
+    angle = math.acos(min(max(half_det, -1.0), 1.0)) / 3.0
+    values[2] = mean + 2.0 * spread * math.cos(angle)
+    values[0] = mean + 2.0 * spread * math.cos(angle + 2.0 * math.pi / 3.0)
+    values[1] = 3.0 * mean - values[0] - values[2]
+    # It is across all rows of A - λ I; the two that are least alike tell it best.
+    c00, c11, c22 = a00 - values[0], a11 - values[0], a22 - values[0]
+    longest_sq = 0.0
+    for pair in range(3):
+        if pair == 0:
+            x, y, z = a01 * a12 - a02 * c11, a02 * a01 - c00 * a12, c00 * c11 - a01 * a01
+        elif pair == 1:
+            x, y, z = a01 * c22 - a02 * a12, a02 * a02 - c00 * c22, c00 * a12 - a01 * a02
+        else:
+            x, y, z = c11 * c22 - a12 * a12, a12 * a02 - a01 * c22, a01 * a12 - c11 * a02
+        length_sq = x * x + y * y + z * z
+        if length_sq > longest_sq:
+            longest_sq = length_sq
+            length = math.sqrt(length_sq)
+            normal[0], normal[1], normal[2] = x / length, y / length, z / length
+
+
+@numba.njit(cache=True, inline="always")
+def moved(point, motion):
+    """Where a motion (3, 4) or (4, 4) takes a point (3,): x, y, z in metres."""
+    x, y, z = point[0], point[1], point[2]
+    return (motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * z + motion[0, 3],
+            motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * z + motion[1, 3],
+            motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * z + motion[2, 3])
+
+
+@numba.njit(cache=True, inline="always")
+def turned(vector, motion):
+    """Where the rotation of a motion (3, 4) or (4, 4) takes a direction (3,): x, y, z."""
+    x, y, z = vector[0], vector[1], vector[2]
+    return (motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * z,
+            motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * z,
+            motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * z)
+
+
+@numba.njit(cache=True)
 def solve_positive6(matrix, right):
     """Solve matrix x = right, positive definite (6, 6); x replaces right (6,), and matrix is overwritten."""
-    for j in range(6):
+    _solve_positive(matrix, right, 6)
+
+
+@numba.njit(cache=True)
+def solve_positive3(matrix, right):
+    """Solve matrix x = right, positive definite (3, 3); x replaces right (3,), and matrix is overwritten."""
+    _solve_positive(matrix, right, 3)
+
+
+@numba.njit(cache=True)
+def solve_positive4(matrix, right):
+    """Solve matrix x = right, positive definite (4, 4); x replaces right (4,), and matrix is overwritten."""
+    _solve_positive(matrix, right, 4)
+
+
+@numba.njit(cache=True, inline="always")
+def _solve_positive(matrix, right, size):
+    """By Cholesky's factors."""
+    for j in range(size):
         for k in range(j):
             matrix[j, j] -= matrix[j, k] * matrix[j, k]
         matrix[j, j] = math.sqrt(matrix[j, j])
-        for i in range(j + 1, 6):
+        for i in range(j + 1, size):
             for k in range(j):
                 matrix[i, j] -= matrix[i, k] * matrix[j, k]
             matrix[i, j] /= matrix[j, j]
-    for i in range(6):
+    for i in range(size):
         for k in range(i):
             right[i] -= matrix[i, k] * right[k]
         right[i] /= matrix[i, i]
-    for i in range(5, -1, -1):
-        for k in range(i + 1, 6):
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
             right[i] -= matrix[k, i] * right[k]
         right[i] /= matrix[i, i]

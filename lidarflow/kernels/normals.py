@@ -4,9 +4,10 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import grid
-from lidarflow.kernels.linalg import symmetric_eigen3
+from lidarflow.kernels.linalg import plane_eigen3
 
 _MIN_NEIGHBOURS = 4
+_CHUNK = 256         # points that one thread takes at a time
 _MIN_SPREAD = 1e-3   # a neighbourhood thinner than this share of its length is a line, not a surface
 
 
@@ -22,38 +23,53 @@ def estimate(points: np.ndarray, surface: np.ndarray, radius_m: float) -> np.nda
 @numba.njit(cache=True, parallel=True)
 def _estimate(points, surface, keys, lower, shape, radius_m):
     normals = np.full((len(points), 3), np.nan)
-    radius_sq = radius_m * radius_m
-    for i in numba.prange(len(points)):
-        starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
-        values, vectors = np.empty(3), np.empty((3, 3))
-        p = points[i]
-        count = 0
-        sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
-        for run in range(grid.runs(p, keys, lower, shape, radius_m, starts, ends)):
-            for j in range(starts[run], ends[run]):
-                x, y, z = surface[j, 0] - p[0], surface[j, 1] - p[1], surface[j, 2] - p[2]
-                if x * x + y * y + z * z > radius_sq:
-                    continue
-                count += 1
-                sx += x
-                sy += y
-                sz += z
-                sxx += x * x
-                sxy += x * y
-                sxz += x * z
-                syy += y * y
-                syz += y * z
-                szz += z * z
-        if count < _MIN_NEIGHBOURS:
-            continue
-        mx, my, mz = sx / count, sy / count, sz / count
-        symmetric_eigen3(sxx / count - mx * mx, sxy / count - mx * my, sxz / count - mx * mz,
-                         syy / count - my * my, syz / count - my * mz, szz / count - mz * mz,
-                         values, vectors)
-        if values[1] <= _MIN_SPREAD * values[2]:
-            continue
-        facing = vectors[0, 0] * p[0] + vectors[1, 0] * p[1] + vectors[2, 0] * p[2]
-        sign = -1.0 if facing > 0.0 else 1.0
-        for k in range(3):
-            normals[i, k] = sign * vectors[k, 0]
+    for chunk in numba.prange((len(points) + _CHUNK - 1) // _CHUNK):
+        start, end = chunk * _CHUNK, (chunk + 1) * _CHUNK
+        _estimate_some(points[start:end], surface, keys, lower, shape, radius_m, normals[start:end])
     return normals
+
+
+@numba.njit(cache=True)
+def _estimate_some(points, surface, keys, lower, shape, radius_m, normals):
+    starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
+    values, across = np.empty(3), np.empty(3)
+    last, run_count = (0, 0, 0), 0
+    for i in range(len(points)):
+        # Points that follow one another are often in one cell.
+        cell = grid.cell_of(points[i], lower, radius_m)
+        if i == 0 or cell != last:
+            last = cell
+            run_count = grid.runs_around(cell, keys, shape, starts, ends)
+        _fit(points[i], surface, radius_m * radius_m, starts, ends, run_count, values, across, normals[i])
+
+
+@numba.njit(cache=True)
+def _fit(p, surface, radius_sq, starts, ends, run_count, values, across, normal):
+    """Fill `normal` (3,) at p (3,) from the runs of the surface around it, if it has one."""
+    count = 0
+    sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
+    for run in range(run_count):
+        for j in range(starts[run], ends[run]):
+            x, y, z = surface[j, 0] - p[0], surface[j, 1] - p[1], surface[j, 2] - p[2]
+            if x * x + y * y + z * z > radius_sq:
+                continue
+            count += 1
+            sx += x
+            sy += y
+            sz += z
+            sxx += x * x
+            sxy += x * y
+            sxz += x * z
+            syy += y * y
+            syz += y * z
+            szz += z * z
+    if count < _MIN_NEIGHBOURS:
+        return
+    mx, my, mz = sx / count, sy / count, sz / count
+    plane_eigen3(sxx / count - mx * mx, sxy / count - mx * my, sxz / count - mx * mz,
+                 syy / count - my * my, syz / count - my * mz, szz / count - mz * mz, values, across)
+    if values[1] <= _MIN_SPREAD * values[2]:
+        return
+    sign = -1.0 if across[0] * p[0] + across[1] * p[1] + across[2] * p[2] > 0.0 else 1.0
+    for k in range(3):
+        normal[k] = sign * across[k]

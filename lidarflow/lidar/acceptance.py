@@ -4,10 +4,10 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import ObjectsConfig
-from lidarflow.lidar.body import Body
-from lidarflow.lidar.clusters import near_rows
+from lidarflow.kernels import ground_plane, tree
+from lidarflow.lidar.body import Body, near_rows
 from lidarflow.lidar.evidence import tolerance
-from lidarflow.lidar.surface import CAP_M, misfit, nearest
+from lidarflow.lidar.surface import CAP_M, misfit_after
 from lidarflow.lidar.view import View
 
 _GROUND_RADIUS_M = 10.0
@@ -31,24 +31,24 @@ def moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
     shift = (moved - points).mean(axis=0)
     if np.hypot(shift[0], shift[1]) < config.min_speed_m_per_s * dt_s:
         return False
+    # What costs most comes last.
     return (
-        _clearance(view, points) <= config.max_clearance_m
-        and _shape_ratio(view, body, moved) <= config.max_shape_ratio
-        and not _surroundings_gain(view, body, points, shift)
-        and _observability(view, body, shift) >= config.min_observability
-        and _matches_agree(view, body, shift, config)
+        _observability(view, body, shift) >= config.min_observability
         and min(_left_and_arrived(view, body, moved)) >= config.min_unexplained * _should_show(
-            view, body, moved, shift, config))
+            view, body, moved, shift, config)
+        and _matches_agree(view, body, shift, config)
+        and _clearance(view, points) <= config.max_clearance_m
+        and _shape_ratio(view, body, moved) <= config.max_shape_ratio
+        and not _surroundings_gain(view, body, shift))
 
 
 def _clearance(view: View, points: np.ndarray) -> float:
     """Height in metres of the lowest point over the ground around it; 0 where no ground is seen."""
     lowest = points[np.argmin(points[:, 2])]
-    ground = np.asarray(view.ground.data)
-    near = np.hypot(ground[:, 0] - lowest[0], ground[:, 1] - lowest[1]) <= _GROUND_RADIUS_M
-    if near.sum() < _MIN_GROUND_POINTS:
+    heights = ground_plane.heights(view.ground, lowest[0], lowest[1], _GROUND_RADIUS_M)
+    if len(heights) < _MIN_GROUND_POINTS:
         return 0.0
-    return float(lowest[2] - np.median(ground[near, 2]))
+    return float(lowest[2] - np.median(heights))
 
 
 def _shape_ratio(view: View, body: Body, moved: np.ndarray) -> float:
@@ -61,21 +61,19 @@ def _shape_ratio(view: View, body: Body, moved: np.ndarray) -> float:
     own_sq = (view.after(seen, body.over_ground).plane_m**2).sum()
     ego_sq = (view.by_ego.plane_m[seen] ** 2).sum()
 
-    around = near_rows(view.upright.points, moved, _AROUND_M)
-    there, normals = view.upright.points[around], view.upright.normals[around]
+    around = tree.near_rows(view.upright.tree, tree.build(moved), _AROUND_M)
     back = pose.inverse(body.over_ground)
-    brought_back = pose.apply(back, there), pose.turn(back, normals)
-    own_sq += (misfit(*brought_back, view.source, view.source_tree).plane_m ** 2).sum()
-    ego_sq += (misfit(there, normals, view.source, view.source_tree).plane_m ** 2).sum()
+    own_sq += (misfit_after(view.upright, around, back, view.source).plane_m ** 2).sum()
+    ego_sq += (misfit_after(view.upright, around, np.eye(4), view.source).plane_m ** 2).sum()
     return float(own_sq / ego_sq) if ego_sq > 0 else np.inf
 
 
-def _surroundings_gain(view: View, body: Body, points: np.ndarray, shift: np.ndarray) -> bool:
+def _surroundings_gain(view: View, body: Body, shift: np.ndarray) -> bool:
     """Whether the same motion explains more of what surrounds the body too: then the ego-motion is off."""
     if np.linalg.norm(shift) > CAP_M:
         return False   # no ego-motion is that far off
     around = np.setdiff1d(
-        near_rows(view.points, points, _SURROUNDINGS_M), near_rows(view.points, points, _OWN_M))
+        near_rows(view, body.rows, _SURROUNDINGS_M), near_rows(view, body.rows, _OWN_M), assume_unique=True)
     if len(around) < _MIN_SURROUNDINGS:
         return False
     gain_m = view.by_ego.plane_m[around] - view.after(around, body.over_ground).plane_m
@@ -94,7 +92,9 @@ def _observability(view: View, body: Body, shift: np.ndarray) -> float:
 
 def _matches_agree(view: View, body: Body, shift: np.ndarray, config: ObjectsConfig) -> bool:
     """Whether the body's median descriptor match is nearer to its motion than to rest, along the ground."""
-    on_body = np.isin(view.match_rows, body.rows)
+    is_body = np.zeros(len(view.points), bool)
+    is_body[body.rows] = True
+    on_body = is_body[view.match_rows]
     if on_body.sum() < max(config.min_matches, 1):
         return config.min_matches == 0
     points, match_shift = view.points[view.match_rows[on_body]], view.match_shift[on_body]
@@ -108,9 +108,9 @@ def _left_and_arrived(view: View, body: Body, moved: np.ndarray) -> tuple[float,
     What a newcomer hides seems to have left, but has arrived nowhere new.
     """
     left = float(view.evidence.unexplained[body.rows].mean())
-    off_m, row = nearest(view.upright_tree, moved, CAP_M)
-    found = np.isfinite(off_m)
-    return left, float(view.has_appeared[row[found]].mean()) if found.any() else 0.0
+    _, row = tree.query(view.upright.tree, moved, CAP_M)
+    row = row[row >= 0]
+    return left, float(view.has_appeared[row].mean()) if len(row) else 0.0
 
 
 def _should_show(

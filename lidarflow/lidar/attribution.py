@@ -6,6 +6,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import Config
+from lidarflow.kernels import tree
 from lidarflow.lidar import objects, tracking, uncertainty
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
@@ -56,7 +57,7 @@ def attribute(
     """
     points = pair.source.points
     rows = np.flatnonzero(source.usable & ~source.ground)
-    view = _view(pair, source, target, rows, matches, ego_motion, config)
+    view = _view(source, target, rows, matches, ego_motion, config)
     bodies = objects.find(view, pair.dt_s, config.objects, _expected(tracks, ego_motion))
 
     owner, explained = np.full(len(points), WORLD), np.zeros(len(points), bool)
@@ -78,16 +79,13 @@ def attribute(
 
 
 def _view(
-    pair: ScanPair, source: Features, target: Features, rows: np.ndarray,
-    matches: tuple[np.ndarray, np.ndarray], ego_motion: np.ndarray, config: Config,
+    source: Features, target: Features, rows: np.ndarray, matches: tuple[np.ndarray, np.ndarray],
+    ego_motion: np.ndarray, config: Config,
 ) -> View:
-    points = pair.source.points
-    at = np.full(len(points), -1)
+    at = np.full(len(source.usable), -1)
     at[rows] = np.arange(len(rows))
-    return view_of_pair.look(
-        pose.apply(ego_motion, points[rows]), pair.target.points[target.usable],
-        target.ground[target.usable], pose.apply(ego_motion, points[source.usable]),
-        source.ground[source.usable], (at[matches[0]], matches[1]), config.normals.radius_m, config.objects)
+    moved = source.cloud.moved(ego_motion, config.shot.surface_voxel_m, config.normals.radius_m)
+    return view_of_pair.look(moved, target.cloud, (at[matches[0]], matches[1]), config.objects)
 
 
 def _expected(tracks: Tracks, ego_motion: np.ndarray) -> tuple[Expected, ...]:
@@ -96,7 +94,7 @@ def _expected(tracks: Tracks, ego_motion: np.ndarray) -> tuple[Expected, ...]:
     for track in tracks.followed:
         points = pose.apply(ego_motion, track.points)
         moved = pose.apply(track.goes_on(ego_motion), points)
-        expected.append(Expected(points, (moved - points).mean(axis=0)))
+        expected.append(Expected(tree.build(points), (moved - points).mean(axis=0)))
     return tuple(expected)
 
 

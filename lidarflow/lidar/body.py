@@ -3,13 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import grid
-from lidarflow.lidar import clusters, rigid_fit
-from lidarflow.lidar.clusters import near_rows
-from lidarflow.lidar.evidence import tolerance
+from lidarflow.kernels import grid, ground_plane, links, tree
+from lidarflow.lidar import rigid_fit
 from lidarflow.lidar.view import View
 
 _LINK_M = 0.5            # points of one body hang together at this distance
@@ -49,20 +46,26 @@ def grown(
     The side of a car that moves along itself is explained by either motion, and belongs to the car when
     the car's motion explains it about as well.
     """
-    near = near_rows(view.points, view.points[seed], _FIRST_REACH_M)
+    is_seed, is_near = np.zeros((2, len(view.points)), bool)
+    is_seed[seed] = True
+    near = near_rows(view, seed, _FIRST_REACH_M)
     body = None
     for _ in range(_GROWTH_ROUNDS):
         rows = near[free[near]]
-        rows = rows[_agrees(view, rows, over_ground, config)]
+        rows = rows[_agrees(view, rows, over_ground)]
         if len(rows) < config.min_points:
             return None
-        label = clusters.linked(view.points[rows], _LINK_M)
-        rows = rows[np.isin(label, label[np.isin(rows, seed)])]
+        label = links.components(view.points[rows], _LINK_M)
+        holds_seed = np.zeros(len(rows), bool)   # by label
+        holds_seed[label[is_seed[rows]]] = True
+        rows = rows[holds_seed[label]]
         if len(rows) < config.min_points:
             return None
         over_ground = fitted(view, rows, over_ground, config)
         body = Body(rows, over_ground)
-        wider = np.union1d(near, near_rows(view.points, view.points[rows], _REACH_M))
+        is_near[near] = True
+        is_near[near_rows(view, rows, _REACH_M)] = True
+        wider = np.flatnonzero(is_near)
         if len(wider) == len(near):
             break
         near = wider
@@ -75,11 +78,11 @@ def fitted(view: View, rows: np.ndarray, start: np.ndarray, config: ObjectsConfi
         rows = rows[grid.first_per_voxel(view.points[rows], _FIT_VOXEL_M)]
     points = view.points[rows]
     return rigid_fit.onto_planes(
-        points, view.source.normals[rows], view.upright, view.upright_tree, start,
+        points, view.source.normals[rows], view.upright, start,
         _ground_normal(view, points.mean(axis=0)), config.along_ground)
 
 
-def completed(view: View, body: Body, free: np.ndarray, config: ObjectsConfig) -> Body:
+def completed(view: View, body: Body, free: np.ndarray) -> Body:
     """The body with the points it surrounds and the fragments that follow it; `free` (N,) may be taken.
 
     A mesh or a linkage cuts a body at its glass and its edges; what lies amid its points or moves along
@@ -87,35 +90,37 @@ def completed(view: View, body: Body, free: np.ndarray, config: ObjectsConfig) -
     """
     on_body = np.zeros(len(view.points), bool)
     on_body[body.rows] = True
-    near = near_rows(view.points, view.points[body.rows], _FRAGMENT_M)
+    near = near_rows(view, body.rows, _FRAGMENT_M)
     near = near[free[near] & ~on_body[near]]
     if len(near) == 0:
         return body
     after, by_ego = view.after(near, body.over_ground), view.by_ego.distance_m[near]
-    follows = (after.distance_m <= _tolerance_at(view, near, config))
+    follows = (after.distance_m <= view.tolerance_m[near])
     follows &= (after.distance_m < by_ego - _CLEARLY_BETTER_M) & view.evidence.unexplained[near]
     on_body[near[follows]] = True
     # Twice: what the first round adds surrounds others.
     for _ in range(2):
-        on_body[near[_surrounded(view.points, on_body, near)]] = True
+        on_body[near[_surrounded(view, on_body, near)]] = True
     return Body(np.flatnonzero(on_body), body.over_ground)
 
 
-def _surrounded(points: np.ndarray, on_body: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def near_rows(view: View, rows: np.ndarray, radius_m: float) -> np.ndarray:
+    """Ascending rows of the view's points within `radius_m` of any of those at `rows` (K,)."""
+    return tree.near_rows(view.source.tree, tree.build(view.points[rows]), radius_m)
+
+
+def _surrounded(view: View, on_body: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Whether (K,) most neighbours of each of `rows` are on the body."""
-    around = near_rows(points, points[rows], _SURROUND_M)
-    of_body = cKDTree(points[around[on_body[around]]]).query_ball_point(
-        points[rows], _SURROUND_M, return_length=True)
-    of_all = cKDTree(points[around]).query_ball_point(points[rows], _SURROUND_M, return_length=True)
-    others = of_all - 1 - (of_body - on_body[rows])   # the point itself has no say
-    return (of_body - on_body[rows]) > others
+    marks = np.column_stack([on_body, ~on_body])
+    of_body, others = tree.counts_around(view.source.tree, marks, view.points[rows], _SURROUND_M).T
+    return of_body - on_body[rows] > others - ~on_body[rows]   # the point itself has no say
 
 
-def _agrees(view: View, rows: np.ndarray, over_ground: np.ndarray, config: ObjectsConfig) -> np.ndarray:
+def _agrees(view: View, rows: np.ndarray, over_ground: np.ndarray) -> np.ndarray:
     """Whether (K,) the motion explains the points at `rows` clearly better, or in place and about as well."""
     own = view.after(rows, over_ground)
     ego_m, ego_plane_m = view.by_ego.distance_m[rows], view.by_ego.plane_m[rows]
-    fits = own.distance_m <= _tolerance_at(view, rows, config)
+    fits = own.distance_m <= view.tolerance_m[rows]
     better = own.distance_m < ego_m - _CLEARLY_BETTER_M
     plane_better = fits & (own.plane_m < ego_plane_m - _AS_GOOD_M)
     as_good = fits & (own.distance_m < ego_m + _AS_GOOD_M) & (own.plane_m < ego_plane_m + _CLEARLY_BETTER_M)
@@ -123,20 +128,11 @@ def _agrees(view: View, rows: np.ndarray, over_ground: np.ndarray, config: Objec
     return (better | plane_better | as_good) & ~plane_worse
 
 
-def _tolerance_at(view: View, rows: np.ndarray, config: ObjectsConfig) -> np.ndarray:
-    return tolerance(np.linalg.norm(view.points[rows], axis=1), config)
-
-
 def _ground_normal(view: View, centre: np.ndarray) -> np.ndarray:
     """Unit normal (3,) of the ground around `centre` (3,), upright where too little of it is seen."""
     up = np.array([0.0, 0.0, 1.0])
-    near = view.ground.query_ball_point(centre, _SLOPE_RADIUS_M) if view.ground.n else []
-    if len(near) < _MIN_SLOPE_POINTS:
+    rise_x, rise_y, count = ground_plane.slope(view.ground, centre, _SLOPE_RADIUS_M)
+    if count < _MIN_SLOPE_POINTS or np.hypot(rise_x, rise_y) > _MAX_SLOPE:
         return up
-    points = view.ground.data[near]
-    level = points - points.mean(axis=0)
-    slope, *_ = np.linalg.lstsq(level[:, :2], level[:, 2], rcond=1e-3)
-    if np.hypot(*slope) > _MAX_SLOPE:
-        return up
-    normal = np.array([-slope[0], -slope[1], 1.0])
+    normal = np.array([-rise_x, -rise_y, 1.0])
     return normal / np.linalg.norm(normal)

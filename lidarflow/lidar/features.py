@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarflow.config import Config
-from lidarflow.kernels import grid, normals, shot
+from lidarflow.kernels import grid, shot, tree
 from lidarflow.lidar import ground, preparation
+from lidarflow.lidar.surface import Cloud, Surface
 from lidarflow.types import Scan
 
 
@@ -28,16 +29,21 @@ class Features:
 
     usable       (N,) bool          as in Masks
     ground       (N,) bool
-    surface      (S, 3) float64     thinned non-ground points, metres
+    cloud        Cloud              these points: what stands upright, rows ascending, and the ground
     keypoint     (K,) int64         rows of the scan
     descriptors  (K, 352) float32   SHOT of each keypoint, unit norm
     """
 
     usable: np.ndarray
     ground: np.ndarray
-    surface: np.ndarray
+    cloud: Cloud
     keypoint: np.ndarray
     descriptors: np.ndarray
+
+    @property
+    def surface(self) -> np.ndarray:
+        """Thinned non-ground points (S, 3), metres."""
+        return self.cloud.upright.points[self.cloud.upright.thinned]
 
 
 def masks(scan: Scan, config: Config) -> Masks:
@@ -51,14 +57,12 @@ def extract(scan: Scan, config: Config) -> Features:
     """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid and their descriptors."""
     seen = masks(scan, config)
     rows = np.flatnonzero(seen.usable & ~seen.ground)
-    surface = _thinned(scan.points[rows], config.shot.surface_voxel_m)
-    keypoint = rows[grid.first_per_voxel(scan.points[rows], config.matching.keypoint_voxel_m)]
+    upright = Surface.of(scan.points[rows], config.shot.surface_voxel_m, config.normals.radius_m)
+    ground_tree = tree.build(scan.points[seen.usable & seen.ground])
+    keypoint = rows[grid.first_per_voxel(upright.points, config.matching.keypoint_voxel_m)]
     descriptors, _ = shot.describe(
-        scan.points[keypoint], surface, normals.estimate(surface, surface, config.normals.radius_m),
+        scan.points[keypoint], upright.points[upright.thinned], upright.normals[upright.thinned],
         config.shot.radius_m, config.shot.min_neighbours)
     described = np.isfinite(descriptors[:, 0])
-    return Features(seen.usable, seen.ground, surface, keypoint[described], descriptors[described])
-
-
-def _thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
-    return points if voxel_m == 0 else points[grid.first_per_voxel(points, voxel_m)]
+    return Features(
+        seen.usable, seen.ground, Cloud(upright, ground_tree), keypoint[described], descriptors[described])

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from lidarflow.lidar.clusters import near_rows
+from lidarflow.kernels import tree, votes
+from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.surface import CAP_M
 from lidarflow.lidar.view import View
 
@@ -24,11 +24,11 @@ _MIN_SHIFTED = 5
 class Expected:
     """An object that earlier pairs lead to expect.
 
-    points  (K, 3)   where it should be before it moves, metres, in the frame of the view
-    shift   (3,)     what it should do over ground, metres
+    points  Tree    over its points (K, 3) where they should be before they move, in the frame of the view
+    shift   (3,)    what it should do over ground, metres
     """
 
-    points: np.ndarray
+    points: Tree
     shift: np.ndarray
 
 
@@ -37,8 +37,9 @@ def translations(
 ) -> list[np.ndarray]:
     """Translations over ground (3,), metres, of the seeds at `rows` (K,), whose planes tell shifts (K, 3)."""
     points = view.points[rows]
-    return [*_of_matches(view, points), *_of_planes(shift), *_of_expected(points, expected),
-            *_of_votes(view, points, max_shift_m)]
+    body = tree.build(points)
+    return [*_of_matches(view, body), *_of_planes(shift), *_of_expected(body, expected),
+            *_of_votes(view, points, body, max_shift_m)]
 
 
 def spread(points: np.ndarray, count: int) -> np.ndarray:
@@ -48,15 +49,12 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
     return points[np.linspace(0, len(points) - 1, count).astype(int)]
 
 
-def _of_matches(view: View, points: np.ndarray) -> list[np.ndarray]:
+def _of_matches(view: View, body: Tree) -> list[np.ndarray]:
     """The most common shift of the matches on these points, and their median."""
-    near, _ = cKDTree(points).query(view.points[view.match_rows], distance_upper_bound=_MATCH_RADIUS_M)
-    shifts = view.match_shift[np.isfinite(near)]
+    shifts = view.match_shift[tree.near_rows(view.matched, body, _MATCH_RADIUS_M)]
     if len(shifts) < _MIN_MATCHES:
         return []
-    friends = cKDTree(shifts).query_ball_point(shifts, _MATCH_MODE_M)
-    mode = max(friends, key=len)
-    return [shifts[mode].mean(axis=0), np.median(shifts, axis=0)]
+    return [votes.mode(shifts, _MATCH_MODE_M), np.median(shifts, axis=0)]
 
 
 def _of_planes(shift: np.ndarray) -> list[np.ndarray]:
@@ -65,26 +63,16 @@ def _of_planes(shift: np.ndarray) -> list[np.ndarray]:
     return [np.median(known, axis=0)] if len(known) >= _MIN_SHIFTED else []
 
 
-def _of_expected(points: np.ndarray, expected: tuple[Expected, ...]) -> list[np.ndarray]:
+def _of_expected(body: Tree, expected: tuple[Expected, ...]) -> list[np.ndarray]:
     """The shifts of the expected objects that these points may be on."""
-    return [e.shift for e in expected if len(near_rows(e.points, points, _EXPECTED_RADIUS_M))]
+    return [e.shift for e in expected if len(tree.near_rows(e.points, body, _EXPECTED_RADIUS_M))]
 
 
-def _of_votes(view: View, points: np.ndarray, max_shift_m: float) -> list[np.ndarray]:
+def _of_votes(view: View, points: np.ndarray, body: Tree, max_shift_m: float) -> list[np.ndarray]:
     """The translations that most often lead from these points to what appeared near them."""
-    appeared = view.upright.points[view.has_appeared]
-    if len(appeared) == 0:
-        return []
-    distance_m, _ = cKDTree(points).query(appeared, distance_upper_bound=max_shift_m)
-    near = spread(appeared[np.isfinite(distance_m)], 2 * _MAX_VOTERS)
+    near = tree.near_rows(view.appeared, body, max_shift_m)
     if len(near) < _MIN_APPEARED:
         return []
-    shifts = (near[None] - spread(points, _MAX_VOTERS)[:, None]).reshape(-1, 3)
-    along_ground = np.hypot(shifts[:, 0], shifts[:, 1]) <= max_shift_m
-    shifts = shifts[along_ground & (np.abs(shifts[:, 2]) <= CAP_M)]
-    if len(shifts) == 0:
-        return []
-    cells = np.floor(shifts[:, :2] / _VOTE_CELL_M).astype(np.int64)
-    _, member, votes = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    peaks = np.argsort(-votes, kind="stable")[:_VOTE_PEAKS]
-    return [shifts[member.ravel() == cell].mean(axis=0) for cell in peaks]
+    appeared = view.newcomers[spread(near, 2 * _MAX_VOTERS)]
+    return list(votes.peaks(
+        spread(points, _MAX_VOTERS), appeared, max_shift_m, CAP_M, _VOTE_CELL_M, _VOTE_PEAKS))

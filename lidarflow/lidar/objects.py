@@ -4,10 +4,12 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import ObjectsConfig
-from lidarflow.lidar import body, clusters, hypotheses, rigid_fit, seeds
+from lidarflow.kernels import links
+from lidarflow.kernels import misfit as misfit_kernel
+from lidarflow.lidar import body, hypotheses, rigid_fit, seeds
 from lidarflow.lidar.acceptance import moves
 from lidarflow.lidar.body import Body
-from lidarflow.lidar.surface import Misfit
+from lidarflow.lidar.surface import CAP_M, MIN_AGREEMENT, Misfit
 from lidarflow.lidar.view import View
 from lidarflow.types import MovingObject
 
@@ -28,20 +30,19 @@ def find(
     more easily than the rest.
     """
     found = seeds.find(view, [e.points for e in expected], config)
-    label = clusters.linked(view.points[found.rows], _SEED_LINK_M)
+    clusters = _clusters(view, found)
+    starts = _best_starts(view, found, clusters, expected)
     bodies, free = [], np.ones(len(view.points), bool)
-    for cluster in np.argsort(-np.bincount(label), kind="stable") if len(label) else ():
-        mine = (label == cluster) & free[found.rows]
-        seed = found.rows[mine]
-        if len(seed) < _MIN_SEEDS:
-            continue
-        start = _best_start(view, seed, found.shift[mine], expected)
+    for cluster, start in zip(clusters, starts, strict=True):
+        mine = cluster[free[found.rows[cluster]]]
+        if len(mine) < len(cluster):
+            start, = _best_starts(view, found, [mine], expected)
         if start is None:
             continue
-        grown = body.grown(view, seed, start, free, config)
+        grown = body.grown(view, found.rows[mine], start, free, config)
         if grown is None or not moves(view, grown, dt_s, config):
             continue
-        whole = body.completed(view, grown, free, config)
+        whole = body.completed(view, grown, free)
         # What a body surrounds must not speak against it.
         if moves(view, whole, dt_s, config):
             bodies.append(whole)
@@ -62,22 +63,40 @@ def describe(
     return MovingObject(number, motion, over_ground / dt_s, centre, high - low, yaw, len(points))
 
 
-def _best_start(
-    view: View, seed: np.ndarray, shift: np.ndarray, expected: tuple[hypotheses.Expected, ...]
-) -> np.ndarray | None:
-    """Motion (4, 4) of the seed rows that explains them best, of the translations proposed for them.
+def _clusters(view: View, found: seeds.Seeds) -> list[np.ndarray]:
+    """Positions (K,) in the seeds of each cluster that hangs together, the largest first."""
+    label = links.components(view.points[found.rows], _SEED_LINK_M)
+    counts = np.bincount(label)
+    members = np.split(np.argsort(label, kind="stable"), np.cumsum(counts)[:-1])
+    return [members[cluster] for cluster in np.argsort(-counts, kind="stable") if counts[cluster]]
 
-    None where none explains them clearly better than ego-motion does.
+
+def _best_starts(
+    view: View, found: seeds.Seeds, clusters: list[np.ndarray], expected: tuple[hypotheses.Expected, ...]
+) -> list[np.ndarray | None]:
+    """For each cluster of seeds, the motion (4, 4) that explains it best, from what is proposed for it.
+
+    None where there are too few seeds, or none explains them clearly better than ego-motion does.
     """
-    rows, shift = hypotheses.spread(seed, _MAX_START_POINTS), hypotheses.spread(shift, _MAX_START_POINTS)
-    points = view.points[rows]
-    fits = [rigid_fit.onto(points, view.upright_tree, translation)
-            for translation in hypotheses.translations(view, rows, shift, expected, _MAX_SHIFT_M)]
-    left_sq = [_misfit_sq(view.after(rows, fit)) for fit in fits]
-    by_ego = Misfit(view.by_ego.distance_m[rows], view.by_ego.plane_m[rows])
-    if not fits or min(left_sq) > _MAX_START_RATIO * _misfit_sq(by_ego):
-        return None
-    return fits[int(np.argmin(left_sq))]
+    chosen = [hypotheses.spread(cluster, _MAX_START_POINTS) for cluster in clusters]
+    rows = [found.rows[cluster] for cluster in chosen]
+    proposed = [
+        (number, translation) for number, cluster in enumerate(chosen) if len(cluster) >= _MIN_SEEDS
+        for translation in hypotheses.translations(
+            view, rows[number], found.shift[cluster], expected, _MAX_SHIFT_M)]
+    if not proposed:
+        return [None] * len(clusters)
+    fits = rigid_fit.onto([view.points[own] for own in rows], proposed, view.upright.tree)
+    group = np.array([number for number, _ in proposed])
+    left_sq = misfit_kernel.mean_sq_after(
+        view.points, view.source.normals, *rigid_fit.concatenated(rows), group, fits, view.upright.tree,
+        view.upright.normals, view.ground, CAP_M, MIN_AGREEMENT, _DISTANCE_WEIGHT)
+    best = []
+    for number, own in enumerate(rows):
+        mine = np.flatnonzero(group == number)
+        clear = len(mine) and left_sq[mine].min() <= _MAX_START_RATIO * _misfit_sq(view.by_ego[own])
+        best.append(fits[mine[np.argmin(left_sq[mine])]] if clear else None)
+    return best
 
 
 def _misfit_sq(left: Misfit) -> float:

@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import coherence
-from lidarflow.lidar.clusters import near_rows
-from lidarflow.lidar.surface import counterparts, plane_offsets
+from lidarflow.kernels import coherence, tree
+from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.view import View
 
 _NEIGHBOURHOOD_M = 0.5   # evidence is weighed over this neighbourhood
@@ -32,18 +30,18 @@ class Seeds:
     shift: np.ndarray
 
 
-def find(view: View, expected: list[np.ndarray], config: ObjectsConfig) -> Seeds:
+def find(view: View, expected: list[Tree], config: ObjectsConfig) -> Seeds:
     """Unexplained points amid unexplained ones, and points whose surface is shifted as one.
 
     The first finds what moves by more than the spacing of points, the second what moves by less: on leaves,
-    plane distances point all ways and no shift explains them. Where objects are `expected`, given as points
-    (K, 3), everything is a seed.
+    plane distances point all ways and no shift explains them. Where objects are `expected`, given as trees
+    of points, everything is a seed.
     """
     left = _left_behind(view)
     shifted, shift = _shifted(view, config)
     rows = np.union1d(left, shifted)
-    for points in expected:
-        rows = np.union1d(rows, near_rows(view.points, points, _EXPECTED_RADIUS_M))
+    for body in expected:
+        rows = np.union1d(rows, tree.near_rows(view.source.tree, body, _EXPECTED_RADIUS_M))
     shift_of = np.full((len(rows), 3), np.nan)
     shift_of[np.searchsorted(rows, shifted)] = shift
     return Seeds(rows, shift_of)
@@ -54,28 +52,21 @@ def _left_behind(view: View) -> np.ndarray:
     unexplained = np.flatnonzero(view.evidence.unexplained)
     if len(unexplained) == 0:
         return unexplained
-    observable = np.flatnonzero(~view.evidence.blind)
-    points = view.points[unexplained]
-    among_unexplained = _count_around(points, points)
-    among_all = _count_around(view.points[observable], points)
+    marks = np.column_stack([view.evidence.unexplained, ~view.evidence.blind])
+    around = tree.counts_around(view.source.tree, marks, view.points[unexplained], _NEIGHBOURHOOD_M)
+    among_unexplained, among_all = around.T
     return unexplained[(among_unexplained >= _LEFT_POINTS) & (among_unexplained >= _LEFT_SHARE * among_all)]
-
-
-def _count_around(cloud: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return cKDTree(cloud).query_ball_point(points, _NEIGHBOURHOOD_M, return_length=True, workers=-1)
 
 
 def _shifted(view: View, config: ObjectsConfig) -> tuple[np.ndarray, np.ndarray]:
     """Rows (K,) of thinned points whose neighbourhood is shifted by config.min_shift_m or more, and how."""
     rows = view.source.thinned
-    points = view.points[rows]
-    row, _, agrees = counterparts(
-        points, view.source.normals[rows], view.upright, view.upright_tree, _NEIGHBOURHOOD_M)
-    planes = np.full((len(rows), 3), np.nan)
-    planes[agrees] = view.upright.normals[row[agrees]]
-    offsets_m = np.full(len(rows), np.nan)
-    offsets_m[agrees] = plane_offsets(points[agrees], view.upright, row[agrees])
-    shift, count, before_m, after_m = coherence.local_shifts(points, planes, offsets_m, _NEIGHBOURHOOD_M)
+    agrees = view.at_rest.within(_NEIGHBOURHOOD_M)[rows]
+    planes, offsets_m = np.full((len(rows), 3), np.nan), np.full(len(rows), np.nan)
+    planes[agrees] = view.upright.normals[view.at_rest.row[rows[agrees]]]
+    offsets_m[agrees] = view.at_rest.offset_m[rows[agrees]]
+    shift, count, before_m, after_m = coherence.local_shifts(
+        view.points[rows], planes, offsets_m, _NEIGHBOURHOOD_M)
     explained = after_m**2 <= (1.0 - _MIN_COHERENCE) * before_m**2
     shifted = (count >= _MIN_PLANES) & (before_m >= _MIN_RMS_M) & explained
     shifted &= np.linalg.norm(shift, axis=1) >= config.min_shift_m

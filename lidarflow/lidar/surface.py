@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from lidarflow.kernels import grid, normals
+from lidarflow import pose
+from lidarflow.kernels import grid, normals, tree
+from lidarflow.kernels import misfit as kernel
+from lidarflow.kernels.tree import Tree
 
 CAP_M = 0.3             # a point farther off than this is simply not explained
-_MIN_AGREEMENT = 0.7    # |cosine| between the normals of a point and of its counterpart
-_VOXEL_M = 0.12
-_MANY_POINTS = 5000
+MIN_AGREEMENT = 0.7     # |cosine| between the normals of a point and of its counterpart
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,17 +20,48 @@ class Surface:
     points    (N, 3)      metres
     normals   (N, 3)      unit length, NaN where the neighbourhood is no surface
     thinned   (S,) int64  rows that represent it evenly
+    tree      Tree        over its points
     """
 
     points: np.ndarray
     normals: np.ndarray
     thinned: np.ndarray
+    tree: Tree
 
     @classmethod
-    def of(cls, points: np.ndarray, radius_m: float) -> "Surface":
-        """The surface of points (N, 3), normals fitted within `radius_m`."""
-        thinned = grid.first_per_voxel(points, _VOXEL_M)
-        return cls(points, normals.estimate(points, points[thinned], radius_m), thinned)
+    def of(cls, points: np.ndarray, voxel_m: float, radius_m: float) -> "Surface":
+        """The surface of points (N, 3), normals fitted within `radius_m` to those thinned to `voxel_m`.
+
+        A voxel of 0 thins nothing.
+        """
+        thinned, fitted = _fitted(points, voxel_m, radius_m)
+        return cls(points, fitted, thinned, tree.build(points))
+
+    def moved(self, motion: np.ndarray, voxel_m: float, radius_m: float) -> "Surface":
+        """The surface of the same points after a motion (4, 4), thinned and fitted anew."""
+        points = pose.apply(motion, self.points)
+        thinned, fitted = _fitted(points, voxel_m, radius_m)
+        return Surface(points, fitted, thinned, tree.moved(self.tree, points))
+
+
+def _fitted(points: np.ndarray, voxel_m: float, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (S,) of the thinned points (N, 3), and normals (N, 3) fitted to them."""
+    thinned = grid.first_per_voxel(points, voxel_m) if voxel_m else np.arange(len(points))
+    return thinned, normals.estimate(points, points[thinned], radius_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """The points of a scan that take part: what stands upright, and a tree over the ground (G, 3)."""
+
+    upright: Surface
+    ground: Tree
+
+    def moved(self, motion: np.ndarray, voxel_m: float, radius_m: float) -> "Cloud":
+        """The cloud after a motion (4, 4), its surface thinned and fitted anew."""
+        ground = np.empty_like(self.ground.points)
+        ground[self.ground.rows] = pose.apply(motion, self.ground.points)
+        return Cloud(self.upright.moved(motion, voxel_m, radius_m), tree.moved(self.ground, ground))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,39 +75,49 @@ class Misfit:
     distance_m: np.ndarray
     plane_m: np.ndarray
 
+    def __getitem__(self, rows: np.ndarray) -> "Misfit":
+        return Misfit(self.distance_m[rows], self.plane_m[rows])
 
-def nearest(tree: cKDTree, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) of each point (N, 3) to its nearest in `tree`, infinite beyond `reach_m`, and its row."""
-    # Threads take longer to start than a few points to look up.
-    workers = -1 if len(points) > _MANY_POINTS else 1
-    return tree.query(points, distance_upper_bound=reach_m, workers=workers)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Counterparts:
+    """The nearest of a surface to some points.
+
+    row         (N,) int64    of the surface, -1 where none is within reach
+    distance_m  (N,)          to it, infinite where there is none
+    agrees      (N,) bool     its normal is like the point's
+    offset_m    (N,)          how far along that normal its plane lies from the point; NaN unless they agree
+    """
+
+    row: np.ndarray
+    distance_m: np.ndarray
+    agrees: np.ndarray
+    offset_m: np.ndarray
+
+    def __getitem__(self, rows: np.ndarray) -> "Counterparts":
+        return Counterparts(self.row[rows], self.distance_m[rows], self.agrees[rows], self.offset_m[rows])
+
+    def within(self, reach_m: float) -> np.ndarray:
+        """Mask (N,) of the points whose counterpart is nearer than `reach_m` and agrees."""
+        return self.agrees & (self.distance_m < reach_m)
 
 
 def counterparts(
-    points: np.ndarray, point_normals: np.ndarray, surface: Surface, tree: cKDTree, reach_m: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nearest rows (N,) of a surface whose points `tree` holds, distances (N,), and where normals agree (N,).
+    points: np.ndarray, point_normals: np.ndarray, surface: Surface, reach_m: float
+) -> Counterparts:
+    """The nearest of a surface within `reach_m` of points (N, 3) with normals (N, 3)."""
+    return Counterparts(
+        *kernel.counterparts(points, point_normals, surface.tree, surface.normals, reach_m, MIN_AGREEMENT))
 
-    Distances are infinite, and rows 0, where nothing lies within `reach_m`.
+
+def misfit_after(
+    cloud: Surface, rows: np.ndarray, motion: np.ndarray, surface: Surface, beside: Tree = tree.NOTHING
+) -> Misfit:
+    """How far the `rows` (K,) of a cloud are from a surface after `motion` (4, 4).
+
+    Distances also reach what lies `beside`, and planes are never farther.
     """
-    distance_m, row = nearest(tree, points, reach_m)
-    agrees = np.isfinite(distance_m)
-    row = np.where(agrees, row, 0)
-    cosine = (surface.normals[row[agrees]] * point_normals[agrees]).sum(axis=1)
-    with np.errstate(invalid="ignore"):
-        agrees[agrees] = np.abs(cosine) > _MIN_AGREEMENT
-    return row, distance_m, agrees
-
-
-def plane_offsets(points: np.ndarray, surface: Surface, row: np.ndarray) -> np.ndarray:
-    """How far (N,) along its normal, in metres, the plane at `row` (N,) lies from each point (N, 3)."""
-    return (surface.normals[row] * (surface.points[row] - points)).sum(axis=1)
-
-
-def misfit(points: np.ndarray, point_normals: np.ndarray, surface: Surface, tree: cKDTree) -> Misfit:
-    """How far points (N, 3) with normals (N, 3) are from a surface."""
-    row, distance_m, agrees = counterparts(points, point_normals, surface, tree, 2.0 * CAP_M)
-    distance_m = np.minimum(distance_m, CAP_M)
-    plane_m = distance_m.copy()
-    plane_m[agrees] = np.abs(plane_offsets(points[agrees], surface, row[agrees]))
-    return Misfit(distance_m, np.minimum(plane_m, CAP_M))
+    distance_m, plane_m = np.empty(len(rows)), np.empty(len(rows))
+    kernel.after(cloud.points, cloud.normals, rows, motion, surface.tree, surface.normals, beside, CAP_M,
+                 MIN_AGREEMENT, distance_m, plane_m)
+    return Misfit(distance_m, plane_m)

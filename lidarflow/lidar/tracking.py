@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidarflow import pose
+from lidarflow.kernels import tree
 from lidarflow.lidar.hypotheses import spread
 
 _SAME_PLACE_M = 0.5      # points this near to where a track should be lie on it
@@ -56,11 +56,11 @@ def identify(tracks: Tracks, clouds: list[np.ndarray]) -> list[int]:
     the best overlap first. What lies on no track is new.
     """
     overlaps = []
+    places = [tree.build(track.points) for track in tracks.followed]
     for number, points in enumerate(clouds):
         sample = spread(points, _MAX_POINTS)
-        for track in tracks.followed:
-            distance_m, _ = cKDTree(track.points).query(sample, distance_upper_bound=_SAME_PLACE_M)
-            share = float(np.isfinite(distance_m).mean())
+        for track, place in zip(tracks.followed, places, strict=True):
+            share = len(tree.near_rows(tree.build(sample), place, _SAME_PLACE_M)) / len(sample)
             if share >= _MIN_SHARE:
                 overlaps.append((-share, number, track.id))
     ids: dict[int, int] = {}

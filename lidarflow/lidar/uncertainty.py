@@ -4,9 +4,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidarflow import pose
-from lidarflow.kernels import grid
+from lidarflow.kernels import grid, tree
 from lidarflow.lidar.body import Body
-from lidarflow.lidar.surface import CAP_M, counterparts, nearest, plane_offsets
+from lidarflow.lidar.surface import CAP_M, Counterparts, counterparts
 from lidarflow.lidar.view import View
 from lidarflow.types import FlowProblem
 
@@ -29,8 +29,10 @@ def of_world(view: View, still: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
     It rests on the planes of the view's rows `still` (K,) and on the ground.
     """
-    rows = still[np.isin(still, view.source.thinned)]
-    at, normals, off_m = _planes(view, rows, np.eye(4))
+    thinned = np.zeros(len(view.points), bool)
+    thinned[view.source.thinned] = True
+    rows = still[thinned[still]]
+    at, normals, off_m = _planes(view, view.points[rows], view.at_rest[rows])
     ground_at, ground_off_m = _ground(view)
     at, off_m = np.concatenate([at, ground_at]), np.concatenate([off_m, ground_off_m])
     normals = np.concatenate([normals, np.tile([0.0, 0.0, 1.0], (len(ground_at), 1))])
@@ -39,29 +41,30 @@ def of_world(view: View, still: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 def of_body(view: View, body: Body, moved: np.ndarray, along_ground: float) -> np.ndarray:
     """Standard deviation (K,) in metres of points `moved` (K, 3) with a body, target frame."""
-    at, normals, off_m = _planes(view, body.rows, body.over_ground)
+    there = pose.apply(body.over_ground, view.points[body.rows])
+    turned = pose.turn(body.over_ground, view.source.normals[body.rows])
+    at, normals, off_m = _planes(view, there, counterparts(there, turned, view.upright, CAP_M))
     upright = np.tile([[0.0, 0.0, 1.0]], (1 if along_ground > 0 else 0, 1))
     return _std(moved, at, normals, off_m, upright)
 
 
 def _planes(
-    view: View, rows: np.ndarray, over_ground: np.ndarray
+    view: View, points: np.ndarray, found: Counterparts
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the points at `rows` go (K, 3), the planes they meet there (K, 3), and how far off (K,)."""
-    moved = pose.apply(over_ground, view.points[rows])
-    turned = pose.turn(over_ground, view.source.normals[rows])
-    row, _, agrees = counterparts(moved, turned, view.upright, view.upright_tree, CAP_M)
-    at, row = moved[agrees], row[agrees]
-    return at, view.upright.normals[row], plane_offsets(at, view.upright, row)
+    """The points (K, 3) that meet a plane, of those given, its normals (K, 3), and how far off it is (K,)."""
+    met = found.within(CAP_M)
+    return points[met], view.upright.normals[found.row[met]], found.offset_m[met]
 
 
 def _ground(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Ground points (K, 3) of the target, one per cell, and how far over the source's they lie (K,)."""
-    ground = np.asarray(view.ground.data)
+    ground = view.ground.points
     ground = ground[grid.first_per_voxel(ground, _GROUND_CELL_M)]
-    distance_m, row = nearest(view.source_ground, ground, _CELL_M)
-    found = np.isfinite(distance_m)
-    return ground[found], view.source_ground.data[row[found]][:, 2] - ground[found][:, 2]
+    _, row = tree.query(view.source_ground, ground, _CELL_M)
+    ground, row = ground[row >= 0], row[row >= 0]
+    height_m = np.empty(len(view.source_ground.rows))
+    height_m[view.source_ground.rows] = view.source_ground.points[:, 2]
+    return ground, height_m[row] - ground[:, 2]
 
 
 def _std(
@@ -79,19 +82,20 @@ def _std(
         kept = size <= _TRIMMED * max(float(np.median(size)), _LEAST_STD_M)
         at, normals, off_m = at[kept] - centre, normals[kept], off_m[kept]
         variance = max(float((off_m**2).mean()), _LEAST_STD_M**2)
-        _, cell, count = np.unique(
-            np.floor(at / _CELL_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+        cell, count = grid.voxels(at, _CELL_M)
         rows = np.hstack([np.cross(at, normals), normals])
-        information += (rows / (count[cell.ravel()] * variance)[:, None]).T @ rows
+        information += (rows / (count[cell] * variance)[:, None]).T @ rows
     for direction in held:
         row = np.concatenate([np.zeros(3), direction])
         information += np.outer(row, row) / _LEAST_STD_M**2
     covariance = np.linalg.inv(information)
-    # A point at x moves by ω × x + t.
+    # A point at x moves by ω × x + t. This is the trace of J C Jᵀ with J = [−hat(x), I].
     x = moved - centre
-    jacobian = np.concatenate([-pose.hat(x), np.broadcast_to(np.eye(3), (len(x), 3, 3))], axis=2)
-    by_fit_sq = np.einsum("nij,jk,nik->n", jacobian, covariance, jacobian)
-    by_angle_sq = (_CALIBRATION_RAD**2) * (moved**2).sum(axis=1)
+    turns, both, shifts = covariance[:3, :3], covariance[:3, 3:], covariance[3:, 3:]
+    axial = np.array([both[2, 1] - both[1, 2], both[0, 2] - both[2, 0], both[1, 0] - both[0, 1]])
+    by_turn_sq = np.einsum("ni,ni->n", x @ (np.trace(turns) * np.eye(3) - turns), x)
+    by_fit_sq = np.trace(shifts) + 2.0 * (x @ axial) + by_turn_sq
+    by_angle_sq = (_CALIBRATION_RAD**2) * np.einsum("ni,ni->n", moved, moved)
     return np.sqrt(by_fit_sq + _CALIBRATION_M**2 + by_angle_sq)
 
 

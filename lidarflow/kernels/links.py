@@ -1,0 +1,91 @@
+"""Single linkage of points, by union and find."""
+
+import math
+
+import numba
+import numpy as np
+
+from lidarflow.kernels import grid
+from lidarflow.kernels import tree as trees
+
+_CELLS_PER_LINK = 3
+
+
+def components(points: np.ndarray, link_m: float) -> np.ndarray:
+    """Label (N,) of each point (N, 3): points that steps of at most about `link_m` lead between share one.
+
+    Points are first gathered in cells of a third of that distance, whose means are then linked. Labels count
+    from 0 in the order of the components' lowest cells.
+    """
+    return _components(np.ascontiguousarray(points), float(link_m))
+
+
+@numba.njit(cache=True)
+def _components(points, link_m):
+    member, means, place = _cells(points, link_m / _CELLS_PER_LINK)
+    label = _linked(means, trees.grown(means), link_m)
+    of_point = np.empty(len(points), np.int64)
+    for i in range(len(points)):
+        of_point[i] = label[place[member[i]]]
+    return of_point
+
+
+@numba.njit(cache=True)
+def _cells(points, cell_m):
+    """Cell (N,) of each point, means (V, 3) of cells from the lowest on, and the place (V,) of each there."""
+    member, counts = grid.numbered(points, cell_m)
+    count = len(counts)
+    sums, cells = np.zeros((count, 3)), np.empty((count, 3), np.int64)
+    for i in range(len(points)):
+        for k in range(3):
+            sums[member[i], k] += points[i, k]
+            cells[member[i], k] = math.floor(points[i, k] / cell_m)
+    keys = np.zeros(count, np.int64)
+    for k in range(3):
+        lowest, highest = _least_and_most(cells[:, k])
+        for cell in range(count):
+            keys[cell] = keys[cell] * (highest - lowest + 1) + cells[cell, k] - lowest
+    means, place = np.empty((count, 3)), np.empty(count, np.int64)
+    order = np.argsort(keys)
+    for rank in range(count):
+        means[rank] = sums[order[rank]] / counts[order[rank]]
+        place[order[rank]] = rank
+    return member, means, place
+
+
+@numba.njit(cache=True)
+def _least_and_most(values):
+    least = most = 0
+    for i in range(len(values)):
+        least, most = (values[i], values[i]) if i == 0 else (min(least, values[i]), max(most, values[i]))
+    return least, most
+
+
+@numba.njit(cache=True)
+def _linked(points, tree, link_m):
+    """Labels (N,) of the components, in the order of their first points."""
+    parent = np.arange(len(points))
+    found = np.empty(len(points), np.int64)
+    for i in range(len(points)):
+        count = trees.all_within(tree, points[i, 0], points[i, 1], points[i, 2], link_m * link_m, found)
+        for k in range(count):
+            a, b = _root(parent, i), _root(parent, tree.rows[found[k]])
+            parent[max(a, b)] = min(a, b)
+    label, count = np.empty(len(points), np.int64), 0
+    for i in range(len(points)):
+        root = _root(parent, i)
+        if root == i:
+            label[i] = count
+            count += 1
+        else:
+            label[i] = label[root]
+    return label
+
+
+@numba.njit(cache=True)
+def _root(parent, i):
+    """The lowest member known of i's component; the way there is halved for the next time."""
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i

@@ -1,0 +1,105 @@
+"""How far points are from a surface: from its nearest points, and from the planes through them."""
+
+import math
+
+import numba
+import numpy as np
+
+from lidarflow.kernels import tree as trees
+from lidarflow.kernels.linalg import moved, turned
+from lidarflow.kernels.tree import Tree
+
+
+def counterparts(
+    points: np.ndarray, normals: np.ndarray, target: Tree, target_normals: np.ndarray, reach_m: float,
+    min_agreement: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The nearest of a surface to points (N, 3) with normals (N, 3), of those within `reach_m`.
+
+    Returns rows (N,), distances (N,), whether normals agree (N,), and offsets (N,). `target_normals` are
+    aligned with the rows of `target`. Normals agree whose |cosine| is over `min_agreement`. Offsets tell how
+    far along its normal the plane lies from the point, NaN where normals do not agree. Row -1 and an infinite
+    distance where nothing is near.
+    """
+    found = (np.full(len(points), -1), np.full(len(points), np.inf), np.zeros(len(points), bool),
+             np.full(len(points), np.nan))
+    kernel = _counterparts_in_chunks if len(points) > trees.CHUNK else _counterparts
+    kernel(np.ascontiguousarray(points), np.ascontiguousarray(normals), target, target_normals,
+           float(reach_m), min_agreement, *found)
+    return found
+
+
+@numba.njit(cache=True, parallel=True)
+def _counterparts_in_chunks(points, normals, target, target_normals, reach_m, min_agreement, row, distance_m,
+                            agrees, offset_m):
+    for chunk in numba.prange((len(points) + trees.CHUNK - 1) // trees.CHUNK):
+        start, end = chunk * trees.CHUNK, (chunk + 1) * trees.CHUNK
+        _counterparts(points[start:end], normals[start:end], target, target_normals, reach_m, min_agreement,
+                      row[start:end], distance_m[start:end], agrees[start:end], offset_m[start:end])
+
+
+@numba.njit(cache=True)
+def _counterparts(points, normals, target, target_normals, reach_m, min_agreement, row, distance_m, agrees,
+                  offset_m):
+    for i in range(len(points)):
+        place, apart_sq = trees.nearest(
+            target, points[i, 0], points[i, 1], points[i, 2], reach_m * reach_m, -1)
+        if place < 0:
+            continue
+        row[i], distance_m[i] = target.rows[place], math.sqrt(apart_sq)
+        plane = target_normals[row[i]]
+        if agree(plane, normals[i, 0], normals[i, 1], normals[i, 2], min_agreement):
+            agrees[i] = True
+            offset_m[i] = (plane[0] * (target.points[place, 0] - points[i, 0])
+                           + plane[1] * (target.points[place, 1] - points[i, 1])
+                           + plane[2] * (target.points[place, 2] - points[i, 2]))
+
+
+@numba.njit(cache=True, inline="always")
+def agree(normal, x, y, z, min_agreement):
+    """Whether a normal (3,) and x, y, z of unit length lie along nearly one line; NaN agrees with none."""
+    return abs(normal[0] * x + normal[1] * y + normal[2] * z) > min_agreement
+
+
+@numba.njit(cache=True)
+def after(points, normals, rows, motion, target, target_normals, beside, cap_m, min_agreement,
+          distance_m, plane_m):
+    """Fill distances (K,) and plane distances (K,) of the `rows` (K,) of a cloud after a motion (4, 4).
+
+    Both are at most `cap_m`. Distances are to the nearest of `target` and `beside`; plane distances are to
+    the plane of the nearest of `target` within twice the cap where normals agree, and never more.
+    """
+    reach_sq, cap_sq = 4.0 * cap_m * cap_m, cap_m * cap_m
+    for k in range(len(rows)):
+        x, y, z = moved(points[rows[k]], motion)
+        place, apart_sq = trees.nearest(target, x, y, z, reach_sq, -1)
+        _, nearest_sq = trees.nearest(beside, x, y, z, min(apart_sq, cap_sq), -1)
+        distance_m[k] = plane_m[k] = math.sqrt(nearest_sq)
+        if place >= 0:
+            plane = target_normals[target.rows[place]]
+            nx, ny, nz = turned(normals[rows[k]], motion)
+            if agree(plane, nx, ny, nz, min_agreement):
+                at = target.points[place]
+                offset_m = abs(plane[0] * (at[0] - x) + plane[1] * (at[1] - y) + plane[2] * (at[2] - z))
+                plane_m[k] = min(offset_m, distance_m[k])
+
+
+
+@numba.njit(cache=True, parallel=True)
+def mean_sq_after(points, normals, rows, bounds, group, motions, target, target_normals, beside, cap_m,
+                  min_agreement, distance_weight):
+    """Mean (H,) of plane² + weight · distance² after each of motions (H, 4, 4), which moves group[h].
+
+    Groups are rows[bounds[g]: bounds[g + 1]] of points (N, 3) with normals (N, 3).
+    """
+    mean_sq = np.empty(len(group))
+    for h in numba.prange(len(group)):
+        own = rows[bounds[group[h]]: bounds[group[h] + 1]]
+        distance_m, plane_m = np.empty(len(own)), np.empty(len(own))
+        after(points, normals, own, motions[h], target, target_normals, beside, cap_m, min_agreement,
+              distance_m, plane_m)
+        total = 0.0
+        for k in range(len(own)):
+            total += plane_m[k] * plane_m[k] + distance_weight * distance_m[k] * distance_m[k]
+        mean_sq[h] = total / len(own)
+    return mean_sq

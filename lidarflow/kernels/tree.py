@@ -1,0 +1,413 @@
+"""k-d tree over points: nearest neighbours and neighbourhoods, for queries inside other kernels.
+
+Nodes are halves of halves down to small leaves, each with the box around its points; the children of node i
+are 2 i + 1 and 2 i + 2. Points lie in the order of the leaves, so that a node is one run of them.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+_LEAF = 12       # points of a leaf, about
+DEPTH = 64      # nodes that wait while one is searched, at most
+CHUNK = 512      # queries that one thread takes at a time; it takes longer to start than fewer
+
+
+class Tree(NamedTuple):
+    """A k-d tree.
+
+    points  (N, 3) float64   in the order of the leaves
+    rows    (N,) int64       where each of them was before
+    starts  (M,) int64       first point of each node, level by level
+    ends    (M,) int64       and the one after its last
+    low     (M, 3) float64   corners of the box around a node's points
+    high    (M, 3) float64
+    """
+
+    points: np.ndarray
+    rows: np.ndarray
+    starts: np.ndarray
+    ends: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+NOTHING = Tree(
+    np.empty((0, 3)), np.empty(0, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64),
+    np.full((1, 3), np.inf), np.full((1, 3), -np.inf))
+
+
+def build(points: np.ndarray) -> Tree:
+    """The tree over finite points (N, 3), which may be none."""
+    return grown(np.ascontiguousarray(points, float))
+
+
+def moved(tree: Tree, points: np.ndarray) -> Tree:
+    """The tree of the same rows once they have moved together to `points` (N, 3); boxes are made anew."""
+    placed, low, high = _moved(tree, np.ascontiguousarray(points))
+    return tree._replace(points=placed, low=low, high=high)
+
+
+def query(tree: Tree, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (N,) from each of points (N, 3) to the nearest of the tree, and its row (N,).
+
+    Infinite and -1 where nothing is nearer than `reach_m`.
+    """
+    distance_m, row = np.full(len(points), np.inf), np.full(len(points), -1)
+    kernel = _query_in_chunks if len(points) > CHUNK else _query
+    kernel(tree, np.ascontiguousarray(points), float(reach_m), distance_m, row)
+    return distance_m, row
+
+
+def near_rows(tree: Tree, body: Tree, radius_m: float) -> np.ndarray:
+    """Ascending rows of the tree's points that are nearer than `radius_m` to any point of a body."""
+    return np.sort(_near_rows(tree, body, float(radius_m)))
+
+
+def counts_around(
+    tree: Tree, marks: np.ndarray, points: np.ndarray, radius_m: float
+) -> np.ndarray:
+    """How many (K, F) of the tree's points with each of F marks lie within `radius_m` of points (K, 3).
+
+    marks (N, F) bool are aligned with the rows the tree was built from.
+    """
+    counts = np.zeros((len(points), marks.shape[1]), np.int64)
+    before = _before(tree, marks)
+    kernel = _counts_in_chunks if len(points) > CHUNK else _counts_around
+    kernel(tree, before, np.ascontiguousarray(points), float(radius_m), counts)
+    return counts
+
+
+def any_within(tree: Tree, points: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
+    """Whether (N,) the tree has a point as near to each of points (N, 3) as its `reach_m` (N,)."""
+    return _any_within(tree, np.ascontiguousarray(points), reach_m)
+
+
+@numba.njit(cache=True)
+def grown(points):
+    """As `build`, for other kernels."""
+    count, nodes = len(points), 1
+    while count > _LEAF * (nodes + 1) // 2:
+        nodes = 2 * nodes + 1
+    placed, rows = points.copy(), np.arange(count)
+    starts, ends = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64)
+    low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
+    ends[0] = count
+    leaves = nodes // 2
+    for node in range(nodes):
+        start, end = starts[node], ends[node]
+        for i in range(start, end):
+            for k in range(3):
+                low[node, k] = min(low[node, k], placed[i, k])
+                high[node, k] = max(high[node, k], placed[i, k])
+        if node >= leaves:
+            continue
+        middle = (start + end) // 2
+        axis = 0
+        for k in range(1, 3):
+            if high[node, k] - low[node, k] > high[node, axis] - low[node, axis]:
+                axis = k
+        _part(placed, rows, axis, start, end, middle)
+        starts[2 * node + 1], ends[2 * node + 1] = start, middle
+        starts[2 * node + 2], ends[2 * node + 2] = middle, end
+    return Tree(placed, rows, starts, ends, low, high)
+
+
+@numba.njit(cache=True)
+def _moved(tree, points):
+    nodes = len(tree.ends)
+    placed = np.empty_like(points)
+    low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
+    for node in range(nodes - 1, -1, -1):
+        if node >= nodes // 2:
+            for i in range(tree.starts[node], tree.ends[node]):
+                for k in range(3):
+                    placed[i, k] = points[tree.rows[i], k]
+                    low[node, k] = min(low[node, k], placed[i, k])
+                    high[node, k] = max(high[node, k], placed[i, k])
+        else:
+            for k in range(3):
+                low[node, k] = min(low[2 * node + 1, k], low[2 * node + 2, k])
+                high[node, k] = max(high[2 * node + 1, k], high[2 * node + 2, k])
+    return placed, low, high
+
+
+@numba.njit(cache=True)
+def _part(points, rows, axis, start, end, middle):
+    """Reorder start..end so that nothing before `middle` lies beyond anything after it (Hoare 1961)."""
+    left, right = start, end - 1
+    while left < right:
+        pivot = _median(points[left, axis], points[(left + right) // 2, axis], points[right, axis])
+        i, j = left, right
+        while i <= j:
+            while points[i, axis] < pivot:
+                i += 1
+            while points[j, axis] > pivot:
+                j -= 1
+            if i <= j:
+                for k in range(3):
+                    points[i, k], points[j, k] = points[j, k], points[i, k]
+                rows[i], rows[j] = rows[j], rows[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            right = j
+        elif middle >= i:
+            left = i
+        else:
+            return
+
+
+@numba.njit(cache=True, inline="always")
+def _median(a, b, c):
+    return max(min(a, b), min(max(a, b), c))
+
+
+@numba.njit(cache=True, inline="always")
+def box_distance_sq(tree, node, x, y, z):
+    """Squared distance of x, y, z from a node's box, 0 inside it."""
+    dx = max(max(tree.low[node, 0] - x, x - tree.high[node, 0]), 0.0)
+    dy = max(max(tree.low[node, 1] - y, y - tree.high[node, 1]), 0.0)
+    dz = max(max(tree.low[node, 2] - z, z - tree.high[node, 2]), 0.0)
+    return dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True, inline="always")
+def distance_sq(points, i, x, y, z):
+    """Squared distance of x, y, z from point i."""
+    dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+    return dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True)
+def nearest(tree, x, y, z, best_sq, best):
+    """Place in the tree of the point nearest to x, y, z, and its squared distance.
+
+    `best` and `best_sq` where nothing is nearer than the root of `best_sq`.
+    """
+    leaves = len(tree.ends) // 2
+    waiting, waiting_sq = np.empty(DEPTH, np.int64), np.empty(DEPTH)
+    waiting[0], waiting_sq[0], depth = 0, box_distance_sq(tree, 0, x, y, z), 1
+    while depth > 0:
+        depth -= 1
+        node, node_sq = waiting[depth], waiting_sq[depth]
+        if node_sq >= best_sq:
+            continue
+        while node < leaves:
+            left, right = 2 * node + 1, 2 * node + 2
+            left_sq, right_sq = box_distance_sq(tree, left, x, y, z), box_distance_sq(tree, right, x, y, z)
+            if left_sq > right_sq:
+                left, right, left_sq, right_sq = right, left, right_sq, left_sq
+            if right_sq < best_sq:
+                waiting[depth], waiting_sq[depth] = right, right_sq
+                depth += 1
+            node, node_sq = left, left_sq
+        if node_sq >= best_sq:
+            continue
+        for i in range(tree.starts[node], tree.ends[node]):
+            apart_sq = distance_sq(tree.points, i, x, y, z)
+            if apart_sq < best_sq:
+                best, best_sq = i, apart_sq
+    return best, best_sq
+
+
+@numba.njit(cache=True)
+def nearest_two(tree, x, y, z, reach_sq):
+    """Place of the point nearest to x, y, z, its squared distance, and that of the second; none has place -1.
+
+    Distances are `reach_sq` where nothing is nearer.
+    """
+    leaves = len(tree.ends) // 2
+    best, best_sq, second_sq = -1, reach_sq, reach_sq
+    waiting, waiting_sq = np.empty(DEPTH, np.int64), np.empty(DEPTH)
+    waiting[0], waiting_sq[0], depth = 0, box_distance_sq(tree, 0, x, y, z), 1
+    while depth > 0:
+        depth -= 1
+        node, node_sq = waiting[depth], waiting_sq[depth]
+        while node < leaves and node_sq < second_sq:
+            left, right = 2 * node + 1, 2 * node + 2
+            left_sq, right_sq = box_distance_sq(tree, left, x, y, z), box_distance_sq(tree, right, x, y, z)
+            if left_sq > right_sq:
+                left, right, left_sq, right_sq = right, left, right_sq, left_sq
+            if right_sq < second_sq:
+                waiting[depth], waiting_sq[depth] = right, right_sq
+                depth += 1
+            node, node_sq = left, left_sq
+        if node_sq >= second_sq:
+            continue
+        for i in range(tree.starts[node], tree.ends[node]):
+            apart_sq = distance_sq(tree.points, i, x, y, z)
+            if apart_sq < best_sq:
+                best, best_sq, second_sq = i, apart_sq, best_sq
+            elif apart_sq < second_sq:
+                second_sq = apart_sq
+    return best, best_sq, second_sq
+
+
+@numba.njit(cache=True)
+def within(tree, x, y, z, radius_sq):
+    """Place in the tree of some point whose squared distance from x, y, z is at most `radius_sq`, or -1."""
+    leaves = len(tree.ends) // 2
+    waiting = np.empty(DEPTH, np.int64)
+    waiting[0], depth = 0, 1
+    while depth > 0:
+        depth -= 1
+        node = waiting[depth]
+        if box_distance_sq(tree, node, x, y, z) > radius_sq:
+            continue
+        while node < leaves:
+            left, right = 2 * node + 1, 2 * node + 2
+            left_sq, right_sq = box_distance_sq(tree, left, x, y, z), box_distance_sq(tree, right, x, y, z)
+            if left_sq > right_sq:
+                left, right, left_sq, right_sq = right, left, right_sq, left_sq
+            if right_sq <= radius_sq:
+                waiting[depth] = right
+                depth += 1
+            node = left
+        for i in range(tree.starts[node], tree.ends[node]):
+            if distance_sq(tree.points, i, x, y, z) <= radius_sq:
+                return i
+    return -1
+
+
+@numba.njit(cache=True)
+def all_within(tree, x, y, z, radius_sq, found):
+    """Fill `found` with the places at most the root of `radius_sq` from x, y, z; returns how many."""
+    leaves, count = len(tree.ends) // 2, 0
+    waiting = np.empty(DEPTH, np.int64)
+    waiting[0], depth = 0, 1
+    while depth > 0:
+        depth -= 1
+        node = waiting[depth]
+        if box_distance_sq(tree, node, x, y, z) > radius_sq:
+            continue
+        if node < leaves:
+            waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2
+            depth += 2
+            continue
+        for i in range(tree.starts[node], tree.ends[node]):
+            if distance_sq(tree.points, i, x, y, z) <= radius_sq:
+                found[count] = i
+                count += 1
+    return count
+
+
+@numba.njit(cache=True, parallel=True)
+def _query_in_chunks(tree, points, reach_m, distance_m, row):
+    for chunk in numba.prange((len(points) + CHUNK - 1) // CHUNK):
+        start, end = chunk * CHUNK, (chunk + 1) * CHUNK
+        _query(tree, points[start:end], reach_m, distance_m[start:end], row[start:end])
+
+
+@numba.njit(cache=True)
+def _query(tree, points, reach_m, distance_m, row):
+    for i in range(len(points)):
+        place, apart_sq = nearest(tree, points[i, 0], points[i, 1], points[i, 2], reach_m * reach_m, -1)
+        if place >= 0:
+            distance_m[i], row[i] = math.sqrt(apart_sq), tree.rows[place]
+
+
+@numba.njit(cache=True, parallel=True)
+def _any_within(tree, points, reach_m):
+    found = np.zeros(len(points), np.bool_)
+    for i in numba.prange(len(points)):
+        found[i] = within(tree, points[i, 0], points[i, 1], points[i, 2], reach_m[i] * reach_m[i]) >= 0
+    return found
+
+
+@numba.njit(cache=True)
+def _near_rows(tree, body, radius_m):
+    found, count = np.empty(len(tree.rows), np.int64), 0
+    leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
+    waiting = np.empty(DEPTH, np.int64)
+    waiting[0], depth = 0, 1
+    witness = 0   # what was near to the last point is probably near to this one
+    while depth > 0:
+        depth -= 1
+        node = waiting[depth]
+        if not _boxes_are_near(tree, node, body, radius_sq):
+            continue
+        if _farthest_sq(tree, node, body.points, witness) < radius_sq:
+            for i in range(tree.starts[node], tree.ends[node]):
+                found[count] = tree.rows[i]
+                count += 1
+        elif node < leaves:
+            waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2
+            depth += 2
+        else:
+            for i in range(tree.starts[node], tree.ends[node]):
+                x, y, z = tree.points[i, 0], tree.points[i, 1], tree.points[i, 2]
+                if distance_sq(body.points, witness, x, y, z) >= radius_sq:
+                    place, _ = nearest(body, x, y, z, radius_sq, -1)
+                    if place < 0:
+                        continue
+                    witness = place
+                found[count] = tree.rows[i]
+                count += 1
+    return found[:count].copy()
+
+
+@numba.njit(cache=True, inline="always")
+def _boxes_are_near(tree, node, body, radius_sq):
+    """Whether a node's box is nearer than the root of `radius_sq` to the box around the whole body."""
+    apart_sq = 0.0
+    for k in range(3):
+        gap = max(max(tree.low[node, k] - body.high[0, k], body.low[0, k] - tree.high[node, k]), 0.0)
+        apart_sq += gap * gap
+    return apart_sq < radius_sq
+
+
+@numba.njit(cache=True, inline="always")
+def _farthest_sq(tree, node, points, i):
+    """Squared distance from point i to the farthest corner of a node's box."""
+    apart_sq = 0.0
+    for k in range(3):
+        gap = max(points[i, k] - tree.low[node, k], tree.high[node, k] - points[i, k])
+        apart_sq += gap * gap
+    return apart_sq
+
+
+@numba.njit(cache=True)
+def _before(tree, marks):
+    """How many (N + 1, F) points in front of each place have each mark."""
+    before = np.zeros((len(marks) + 1, marks.shape[1]), np.int64)
+    for i in range(len(marks)):
+        for mark in range(marks.shape[1]):
+            before[i + 1, mark] = before[i, mark] + marks[tree.rows[i], mark]
+    return before
+
+
+@numba.njit(cache=True, parallel=True)
+def _counts_in_chunks(tree, before, points, radius_m, counts):
+    for chunk in numba.prange((len(points) + CHUNK - 1) // CHUNK):
+        start, end = chunk * CHUNK, (chunk + 1) * CHUNK
+        _counts_around(tree, before, points[start:end], radius_m, counts[start:end])
+
+
+@numba.njit(cache=True)
+def _counts_around(tree, before, points, radius_m, counts):
+    """Add the counts of marks (K, F) to `counts`; a node in reach as a whole is two look-ups in `before`."""
+    leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
+    waiting = np.empty(DEPTH, np.int64)
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        waiting[0], depth = 0, 1
+        while depth > 0:
+            depth -= 1
+            node = waiting[depth]
+            if box_distance_sq(tree, node, x, y, z) > radius_sq:
+                continue
+            start, end = tree.starts[node], tree.ends[node]
+            if _farthest_sq(tree, node, points, k) <= radius_sq:
+                for mark in range(counts.shape[1]):
+                    counts[k, mark] += before[end, mark] - before[start, mark]
+            elif node < leaves:
+                waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2
+                depth += 2
+            else:
+                for i in range(start, end):
+                    if distance_sq(tree.points, i, x, y, z) <= radius_sq:
+                        for mark in range(counts.shape[1]):
+                            counts[k, mark] += before[i + 1, mark] - before[i, mark]

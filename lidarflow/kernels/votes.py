@@ -1,0 +1,59 @@
+"""Most common shifts: among those that are given, and among all that lead from one cloud to another."""
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True)
+def mode(shifts, radius_m):
+    """Mean (3,) of the shifts (K, 3) around the one that most others are within `radius_m` of."""
+    most, best = 0, 0
+    for i in range(len(shifts)):
+        count = 0
+        for j in range(len(shifts)):
+            count += _apart_sq(shifts, i, j) <= radius_m * radius_m
+        if count > most:
+            most, best = count, i
+    mean = np.zeros(3)
+    for j in range(len(shifts)):
+        if _apart_sq(shifts, best, j) <= radius_m * radius_m:
+            mean += shifts[j]
+    return mean / most
+
+
+@numba.njit(cache=True, inline="always")
+def _apart_sq(shifts, i, j):
+    dx, dy, dz = shifts[i, 0] - shifts[j, 0], shifts[i, 1] - shifts[j, 1], shifts[i, 2] - shifts[j, 2]
+    return dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True)
+def peaks(source, target, max_shift_m, max_rise_m, cell_m, count):
+    """Mean shifts (≤ count, 3) of the cells along the ground that most shifts lead to, most votes first.
+
+    Every shift from one of `source` (N, 3) to one of `target` (M, 3) votes that is no longer along the ground
+    than `max_shift_m` and no higher than `max_rise_m`.
+    """
+    reach = int(np.ceil(max_shift_m / cell_m)) + 1
+    votes = np.zeros((2 * reach + 1, 2 * reach + 1), np.int64)
+    sums = np.zeros((2 * reach + 1, 2 * reach + 1, 3))
+    for i in range(len(source)):
+        for j in range(len(target)):
+            dx, dy = target[j, 0] - source[i, 0], target[j, 1] - source[i, 1]
+            dz = target[j, 2] - source[i, 2]
+            if dx * dx + dy * dy > max_shift_m * max_shift_m or abs(dz) > max_rise_m:
+                continue
+            u, v = int(np.floor(dx / cell_m)) + reach, int(np.floor(dy / cell_m)) + reach
+            votes[u, v] += 1
+            sums[u, v, 0] += dx
+            sums[u, v, 1] += dy
+            sums[u, v, 2] += dz
+    found = np.empty((count, 3))
+    for peak in range(count):
+        best = np.argmax(votes)
+        u, v = best // votes.shape[1], best % votes.shape[1]
+        if votes[u, v] == 0:
+            return found[:peak].copy()
+        found[peak] = sums[u, v] / votes[u, v]
+        votes[u, v] = 0
+    return found

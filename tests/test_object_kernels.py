@@ -1,0 +1,397 @@
+"""Kernels of the object search against slow twins, as in test_kernels.py."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from lidarflow import pose
+from lidarflow.kernels import directions, grid, ground_plane, icp, linalg, links, misfit, tree, votes
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def clumps(count: int, seed: int) -> np.ndarray:
+    """Points (count, 3) that are dense in places, with some of them twice."""
+    random = rng(seed)
+    points = random.normal(size=(count, 3)) * random.choice([0.05, 0.5, 3.0], (count, 1))
+    points[: count // 10] = points[count // 10: 2 * (count // 10)]
+    return points
+
+
+def units(count: int, seed: int, unknown: float = 0.1) -> np.ndarray:
+    """Unit vectors (count, 3), some NaN."""
+    vectors = rng(seed).normal(size=(count, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    vectors[rng(seed + 1).random(count) < unknown] = np.nan
+    return vectors
+
+
+def some_motion(seed: int) -> np.ndarray:
+    random = rng(seed)
+    return pose.from_yaw(random.uniform(-0.1, 0.1), random.uniform(-0.3, 0.3, 3))
+
+
+# ---- tree -----------------------------------------------------------------------------------------------
+
+def check_tree(count: int) -> None:
+    points, queries = clumps(count, 1), np.vstack([clumps(count // 2, 2), [[90.0, 0, 0]]])
+    built = tree.build(points)
+    np.testing.assert_array_equal(built.points, points[built.rows])
+    np.testing.assert_array_equal(np.sort(built.rows), np.arange(count))
+    apart_m = cdist(queries, points)
+
+    found_m, row = tree.query(built, queries, 0.7)
+    near = apart_m.min(axis=1) < 0.7
+    assert near.any() and not near.all()
+    np.testing.assert_allclose(found_m[near], apart_m.min(axis=1)[near], atol=1e-12)
+    np.testing.assert_allclose(apart_m[near, row[near]], found_m[near], atol=1e-12)
+    assert np.isinf(found_m[~near]).all() and (row[~near] == -1).all()
+
+    reach_m = rng(3).uniform(0.01, 1.0, len(queries))
+    np.testing.assert_array_equal(
+        tree.any_within(built, queries, reach_m), apart_m.min(axis=1) <= reach_m)
+    marks = rng(4).random((count, 2)) < 0.4
+    expected = [[(inside & mark).sum() for mark in marks.T] for inside in apart_m <= 0.5]
+    np.testing.assert_array_equal(tree.counts_around(built, marks, queries, 0.5), expected)
+    for radius_m in (0.05, 0.4, 3.0):
+        body = queries[:: max(1, count // 20)]
+        expected = np.flatnonzero(cdist(points, body).min(axis=1) < radius_m)
+        np.testing.assert_array_equal(tree.near_rows(built, tree.build(body), radius_m), expected)
+
+
+def check_moved_tree(count: int) -> None:
+    points, motion = clumps(count, 28), some_motion(29)
+    there = pose.apply(motion, points)
+    found = tree.moved(tree.build(points), there)
+    np.testing.assert_array_equal(found.points, there[found.rows])
+    for start, end, low, high in zip(found.starts, found.ends, found.low, found.high, strict=True):
+        np.testing.assert_array_equal(low, found.points[start:end].min(axis=0))
+        np.testing.assert_array_equal(high, found.points[start:end].max(axis=0))
+    distance_m, row = tree.query(found, there, 0.1)
+    assert (distance_m == 0.0).all() and (there[row] == there).all()
+
+
+def check_empty_tree() -> None:
+    nothing, points = tree.build(np.empty((0, 3))), np.ones((2, 3))
+    for mine, given in zip(nothing, tree.NOTHING, strict=True):
+        np.testing.assert_array_equal(mine, given)
+    assert np.isinf(tree.query(nothing, points, 9.0)[0]).all()
+    assert not tree.any_within(nothing, points, np.full(2, 9.0)).any()
+    assert len(tree.near_rows(nothing, tree.build(points), 9.0)) == 0
+    assert len(tree.near_rows(tree.build(points), nothing, 9.0)) == 0
+    assert (tree.counts_around(nothing, np.zeros((0, 1), bool), points, 9.0) == 0).all()
+
+
+# ---- voxels, links, votes -------------------------------------------------------------------------------
+
+def check_voxel_numbers(count: int) -> None:
+    points = clumps(count, 5)
+    number, counts = grid.voxels(points, 0.3)
+    _, first, member, expected = np.unique(
+        np.floor(points / 0.3), axis=0, return_index=True, return_inverse=True, return_counts=True)
+    rank = np.argsort(np.argsort(first))
+    np.testing.assert_array_equal(number, rank[member.ravel()])
+    np.testing.assert_array_equal(counts[rank], expected)
+
+
+def links_twin(points: np.ndarray, link_m: float) -> np.ndarray:
+    cells, member = np.unique(np.floor(points / (link_m / 3)), axis=0, return_inverse=True)
+    member = member.ravel()
+    means = np.stack([points[member == cell].mean(axis=0) for cell in range(len(cells))])
+    _, label = connected_components(cdist(means, means) <= link_m)
+    return label[member]
+
+
+def check_links(count: int) -> None:
+    points = clumps(count, 6) * 2.0
+    label = links.components(points, 0.9)
+    np.testing.assert_array_equal(label, links_twin(points, 0.9))
+    assert 3 <= label.max() < count / 2
+
+
+def check_votes(count: int) -> None:
+    random = rng(8)
+    shifts = np.concatenate([random.normal(size=(count, 3)), random.normal(0.5, 0.03, (count // 2, 3))])
+    near = cdist(shifts, shifts) <= 0.15
+    expected = shifts[near[near.sum(axis=1).argmax()]].mean(axis=0)
+    np.testing.assert_allclose(votes.mode(shifts, 0.15), expected, atol=1e-12)
+
+    source, target = random.uniform(-2, 2, (count, 3)), random.uniform(-2, 2, (count + 5, 3))
+    every = (target[None] - source[:, None]).reshape(-1, 3)
+    every = every[(np.hypot(every[:, 0], every[:, 1]) <= 1.5) & (np.abs(every[:, 2]) <= 0.6)]
+    _, member, size = np.unique(
+        np.floor(every[:, :2] / 0.2), axis=0, return_inverse=True, return_counts=True)
+    best = np.argsort(-size, kind="stable")[:3]
+    expected = [every[member.ravel() == cell].mean(axis=0) for cell in best]
+    np.testing.assert_allclose(votes.peaks(source, target, 1.5, 0.6, 0.2, 3), expected, atol=1e-12)
+    assert len(votes.peaks(source, target + 50.0, 1.5, 0.6, 0.2, 3)) == 0
+
+
+# ---- misfit, directions, ground -------------------------------------------------------------------------
+
+def counterparts_twin(points, normals, target, target_normals, reach_m):
+    apart_m = cdist(points, target)
+    row, distance_m = apart_m.argmin(axis=1), apart_m.min(axis=1)
+    cosine = (target_normals[row] * normals).sum(axis=1)
+    agrees = (distance_m < reach_m) & (np.abs(np.nan_to_num(cosine)) > 0.7)
+    offset_m = (target_normals[row] * (target[row] - points)).sum(axis=1)
+    return row, distance_m, agrees, offset_m
+
+
+def check_counterparts(count: int) -> None:
+    points, target = clumps(count, 9), clumps(count + 40, 11) + 0.02
+    normals, target_normals = units(count, 12), units(count + 40, 13)
+    given = points, normals, target, target_normals, 0.4
+    _, distance_m, agrees, offset_m = counterparts_twin(*given)
+    found = misfit.counterparts(points, normals, tree.build(target), target_normals, 0.4, 0.7)
+    within = distance_m < 0.4
+    np.testing.assert_array_equal(found[0] >= 0, within)
+    np.testing.assert_allclose(found[1], np.where(within, distance_m, np.inf), atol=1e-12)
+    once = ~(np.abs(np.sort(cdist(points, target), axis=1)[:, 1] - distance_m) < 1e-12)
+    np.testing.assert_array_equal(found[2][once], agrees[once])
+    both = once & agrees
+    np.testing.assert_allclose(found[3][both], offset_m[both], atol=1e-12)
+    assert both.any() and np.isnan(found[3][~found[2]]).all()
+
+
+def check_misfit_after(count: int) -> None:
+    points, target, beside = clumps(count, 14), rng(15).normal(size=(count, 3)), rng(16).normal(size=(30, 3))
+    normals, target_normals = units(count, 17), units(count, 18)
+    rows = np.arange(0, count, 2)
+    bounds, group = np.array([0, 5, len(rows)]), np.array([1, 0, 1])
+    motions = np.stack([some_motion(19), some_motion(20), np.eye(4)])
+    trees = tree.build(target), target_normals, tree.build(beside)
+    means = misfit.mean_sq_after(points, normals, rows, bounds, group, motions, *trees, 0.3, 0.7, 0.25)
+    for h, motion in enumerate(motions):
+        own = rows[bounds[group[h]]: bounds[group[h] + 1]]
+        moved, turned = pose.apply(motion, points[own]), pose.turn(motion, normals[own])
+        _, distance_m, agrees, offset_m = counterparts_twin(moved, turned, target, target_normals, 0.6)
+        distance_m = np.minimum(np.minimum(distance_m, cdist(moved, beside).min(axis=1)), 0.3)
+        plane_m = np.where(agrees, np.minimum(np.abs(offset_m), distance_m), distance_m)
+        found = np.empty((2, len(own)))
+        misfit.after(points, normals, own, motion, *trees, 0.3, 0.7, *found)
+        np.testing.assert_allclose(found, [distance_m, plane_m], atol=1e-12)
+        np.testing.assert_allclose(means[h], (plane_m**2 + 0.25 * distance_m**2).mean(), atol=1e-12)
+
+
+def check_directions(count: int) -> None:
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    others = np.concatenate([rng(21).normal(size=(count, 3)) * 7.0, 3.0 * axes, 5.0 * axes, [[0.0, 0, 0]]])
+    wanted = np.concatenate([units(count, 22, unknown=0.0), axes])
+    seen = others / np.maximum(np.linalg.norm(others, axis=1, keepdims=True), 1e-6)
+    expected = (cdist(wanted, seen) < 0.1).sum(axis=1) >= 2
+    assert expected.any() and not expected.all()
+    np.testing.assert_array_equal(directions.looked_at(wanted, others, 0.1, 2), expected)
+
+
+def check_ground(count: int) -> None:
+    points = rng(23).uniform(-3, 3, (count, 3)) * [1.0, 1.0, 0.02]
+    points[:, 2] += 0.1 * points[:, 0] - 0.05 * points[:, 1]
+    ground, centre = tree.build(points), np.array([0.4, -0.3, 0.2])
+    near = points[np.linalg.norm(points - centre, axis=1) <= 2.0]
+    level = near - near.mean(axis=0)
+    expected = np.linalg.lstsq(level[:, :2], level[:, 2], rcond=1e-3)[0]
+    np.testing.assert_allclose(ground_plane.slope(ground, centre, 2.0), [*expected, len(near)], atol=1e-9)
+    inside = np.hypot(points[:, 0] - 0.4, points[:, 1] + 0.3) <= 1.5
+    found = ground_plane.heights(ground, 0.4, -0.3, 1.5)
+    np.testing.assert_array_equal(np.sort(found), np.sort(points[inside, 2]))
+
+    row = np.column_stack([np.linspace(0, 1, 9), np.zeros(9), np.linspace(0, 0.1, 9)])
+    np.testing.assert_allclose(
+        ground_plane.slope(tree.build(row), row[4], 2.0), [0.1, 0.0, 9], atol=1e-9)
+
+
+# ---- rigid fits -----------------------------------------------------------------------------------------
+
+def about(centre: np.ndarray, turn: float, shift: np.ndarray) -> np.ndarray:
+    return pose.from_translation(centre + shift) @ pose.from_yaw(turn) @ pose.from_translation(-centre)
+
+
+def onto_points_twin(points, translation, target, gates_m, rounds):
+    centre, turn, shift = points.mean(axis=0), 0.0, translation
+    for gate_m in gates_m:
+        for _ in range(rounds):
+            moved = pose.apply(about(centre, turn, shift), points)
+            distance_m, row = cKDTree(target).query(moved, distance_upper_bound=gate_m)
+            paired = np.isfinite(distance_m)
+            if paired.sum() < 4:
+                break
+            a, b, last = points[paired] - centre, target[row[paired]] - centre, (turn, *shift)
+            turn = 0.0
+            if len(a) >= 16:
+                left, right = a[:, :2] - a[:, :2].mean(axis=0), b[:, :2] - b[:, :2].mean(axis=0)
+                turn = np.angle((np.conj(left @ [1, 1j]) * (right @ [1, 1j])).sum())
+                turn = float(np.clip(turn, -0.15, 0.15))
+            shift = b.mean(axis=0) - pose.apply(pose.from_yaw(turn), a.mean(axis=0))
+            if np.abs(np.subtract((turn, *shift), last)).max() < 1e-4:
+                break
+    return about(centre, turn, shift)
+
+
+def check_onto_points(count: int) -> None:
+    target = rng(24).uniform(-1, 1, (3 * count, 3)) * [2.0, 1.0, 0.7]
+    groups = [pose.apply(pose.inverse(some_motion(25)), target[:count]), target[count: count + 9] + 0.1]
+    group = np.array([0, 1, 0])
+    starts = np.array([[0.0, 0.1, 0.0], [-0.1, 0.0, 0.1], [40.0, 0.0, 0.0]])
+    found = icp.onto_points(
+        np.concatenate(groups), np.array([0, count, count + 9]), group, starts, tree.build(target),
+        np.array([1.0, 0.3]), 4)
+    for h in range(3):
+        expected = onto_points_twin(groups[group[h]], starts[h], target, (1.0, 0.3), 4)
+        np.testing.assert_allclose(found[h], expected, atol=1e-9)
+
+
+def plane_step_twin(points, normals, centre, turn, shift, target, target_normals, gate_m, along_ground):
+    """One Gauss-Newton step from stacked, weighted rows."""
+    motion = about(centre, turn, shift)
+    moved, turned = pose.apply(motion, points), pose.turn(motion, normals)
+    row, distance_m, agrees, offset_m = counterparts_twin(moved, turned, target, target_normals, gate_m)
+    paired = np.flatnonzero(distance_m < gate_m)
+    if len(paired) < 4:
+        return None
+    rows, rights, total = [], [], 0.0
+    for i in paired:
+        x, off = moved[i] - centre - shift, target[row[i]] - moved[i]
+        jacobian = np.column_stack([np.cross(UP, x), np.eye(3)])
+        weight = 0.05 / (1.0 + off @ off / 0.15**2) ** 2
+        rows += list(np.sqrt(weight) * jacobian)
+        rights += list(np.sqrt(weight) * off)
+        total += weight
+        if agrees[i]:
+            weight = 1.0 / (1.0 + offset_m[i] ** 2 / 0.05**2) ** 2
+            rows.append(np.sqrt(weight) * target_normals[row[i]] @ jacobian)
+            rights.append(np.sqrt(weight) * offset_m[i])
+            total += weight
+    rows.append(np.sqrt(along_ground * total) * np.array([0.0, *UP]))
+    rights.append(-np.sqrt(along_ground * total) * shift[2])
+    rows = np.array(rows)
+    if len(paired) < 16:
+        rows[:, 0] = 0.0
+    held = np.sqrt(1e-6 * max(total, 1.0)) * np.eye(4)
+    return np.linalg.lstsq(np.vstack([rows, held]), np.concatenate([rights, np.zeros(4)]), rcond=None)[0]
+
+
+def check_onto_planes(count: int, own: int) -> None:
+    random = rng(26)
+    target = random.uniform(-1, 1, (4 * count, 3)) * [2.0, 1.0, 0.7]
+    side = random.integers(0, 3, len(target))
+    target[np.arange(len(target)), side] = np.array([2.0, 1.0, 0.7])[side]
+    target_normals = np.eye(3)[side]
+    motion = some_motion(27)
+    points = pose.apply(pose.inverse(motion), target[:own] + random.normal(0, 0.01, (own, 3)))
+    normals = pose.turn(pose.inverse(motion), target_normals[:own])
+    gates_m = np.array([0.5, 0.5, 0.3, 0.3])
+    found = icp.onto_planes(
+        points, normals, tree.build(target), target_normals, 0.02, np.array([0.1, 0.05, -0.05]), gates_m, UP,
+        1.0, 0.05, 0.15, 0.05, 0.7)
+    centre, turn, shift = points.mean(axis=0), 0.02, np.array([0.1, 0.05, -0.05])
+    for gate_m in gates_m:
+        step = plane_step_twin(
+            points, normals, centre, turn, shift, target, target_normals, gate_m, 1.0)
+        turn, shift = float(np.clip(turn + step[0], -0.15, 0.15)), shift + step[1:]
+    np.testing.assert_allclose(found, about(centre, turn, shift), atol=2e-4 if own >= 16 else 1e-9)
+
+
+def check_solve_positive4(count: int) -> None:
+    for seed in range(count):
+        root, right = rng(seed).normal(size=(4, 6)), rng(100 + seed).normal(size=4)
+        solution = right.copy()
+        linalg.solve_positive4(root @ root.T, solution)
+        np.testing.assert_allclose(solution, np.linalg.solve(root @ root.T, right), rtol=1e-6, atol=1e-9)
+
+
+def check_all_tiny() -> None:
+    """Every comparison on tiny inputs, for interpreted kernels."""
+    check_tree(60)
+    check_moved_tree(60)
+    check_empty_tree()
+    check_voxel_numbers(40)
+    check_links(60)
+    check_votes(12)
+    check_counterparts(40)
+    check_misfit_after(24)
+    check_directions(30)
+    check_ground(60)
+    check_onto_points(20)
+    check_onto_planes(20, 20)
+    check_solve_positive4(2)
+
+
+def test_tree():
+    check_tree(700)
+    check_tree(1500)           # more queries than one thread takes at a time
+    check_empty_tree()
+
+
+def test_a_moved_tree():
+    check_moved_tree(700)
+    assert len(tree.moved(tree.NOTHING, np.empty((0, 3))).points) == 0
+
+
+def test_a_tree_of_many_equal_points():
+    built = tree.build(np.zeros((500, 3)))
+    found_m, _ = tree.query(built, np.array([[0.0, 0.0, 0.3]]), 1.0)
+    assert found_m[0] == 0.3
+    assert len(tree.near_rows(built, tree.build(np.zeros((1, 3))), 0.1)) == 500
+
+
+def test_voxel_numbers():
+    check_voxel_numbers(900)
+    number, counts = grid.voxels(np.empty((0, 3)), 0.5)
+    assert len(number) == len(counts) == 0
+
+
+def test_links():
+    check_links(400)
+
+
+def test_votes():
+    check_votes(60)
+
+
+def test_counterparts():
+    check_counterparts(500)
+    check_counterparts(1200)   # more than one thread takes at a time
+
+
+def test_misfit_after():
+    check_misfit_after(300)
+
+
+def test_directions():
+    check_directions(600)
+
+
+def test_ground():
+    check_ground(800)
+
+
+def test_onto_points():
+    check_onto_points(120)
+
+
+def test_onto_planes():
+    check_onto_planes(150, 150)
+    check_onto_planes(150, 10)
+
+
+def test_solve_positive4():
+    check_solve_positive4(20)
+
+
+def test_object_kernels_are_plain_python_underneath():
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import test_object_kernels; test_object_kernels.check_all_tiny()"],
+        cwd=Path(__file__).parent, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
