@@ -12,7 +12,7 @@ from lidarflow.datasets import Dataset
 from lidarflow.lidar import dynamic, ego, features, frontend, mesh, preparation, start, uncertainty
 from lidarflow.lidar.attribution import WORLD, Attribution, attribute
 from lidarflow.lidar.tracking import Tracks
-from lidarflow.solve import gtsam_lm
+from lidarflow.solve import solve
 from lidarflow.stopwatch import Stopwatch
 from lidarflow.types import FlowResult, Scan, ScanPair
 
@@ -134,7 +134,7 @@ def explain(prepared: Prepared, config: Config, tracks: Tracks) -> tuple[FlowRes
             found = attribute(pair, source, prepared.target, matched, ego_motion, tracks, config)
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
     with timed("solver"):
-        motions, solved, stats = gtsam_lm.solve(graph.problem, config.solver, config.graph.min_matches)
+        motions, solved, stats = solve(graph.problem, config.solver, config.graph.min_matches)
     with timed("dense answer"):
         in_graph = graph.variable >= 0
         is_solved = np.zeros(len(points), bool)

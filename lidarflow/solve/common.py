@@ -7,6 +7,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import SolverConfig
+from lidarflow.errors import SolveError
 from lidarflow.types import FlowProblem, SolveStats
 
 ABSOLUTE_TOLERANCE = 1e-9   # an iteration that gains less energy than this is the last one
@@ -21,6 +22,16 @@ class Step:
     initial_error: float
     final_error: float
     stopped: str
+
+
+def require_finite(problem: FlowProblem) -> None:
+    """Raise SolveError for a problem with numbers that are not finite."""
+    for name in ("points", "initial", "match_target", "group_motions"):
+        wrong = ~np.isfinite(getattr(problem, name))
+        if wrong.any():
+            raise SolveError(
+                f"FlowProblem.{name}: expected finite numbers, found {int(wrong.sum())} that are not; "
+                "leave out what has none")
 
 
 def matches_per_component(problem: FlowProblem, kept: np.ndarray | None = None) -> np.ndarray:

@@ -25,8 +25,10 @@ def solve(
 
     Components are independent problems (Dewan et al. 2016, section IV). Each is optimised first without,
     then with the truncated kernel (eq. 13). A component with fewer than `min_matches` matches, or whose
-    matches the kernel lets go until fewer are left, has no unique solution and keeps its start value.
+    matches the kernel lets go until fewer are left, has no unique solution and keeps its start value. Raises
+    SolveError for a problem with numbers that are not finite.
     """
+    common.require_finite(problem)
     found = problem.initial.copy()
     tried = common.matches_per_component(problem) >= max(min_matches, 1)
     plain, robust = [], []
