@@ -44,6 +44,8 @@ Count = Annotated[int | None, typer.Option("--n-scans", "-n", help="How many sca
 Jump = Annotated[int, typer.Option("--jump", "-j", help="First scan to process.")]
 MethodName = Annotated[
     str, typer.Option("--method", help="ours, or a baseline: zero, ego, icp, ransac_icp.")]
+Solver = Annotated[
+    str | None, typer.Option("--solver", help="fast or gtsam, short for --set solver.method=NAME.")]
 Visualize = Annotated[bool, typer.Option("--visualize", help="Open the viewer, show results as they come.")]
 Arrows = Annotated[bool, typer.Option("--arrows", help="Also record the total flow as arrows.")]
 
@@ -88,6 +90,7 @@ def pair(
     recording: Annotated[Path | None, typer.Option(help="Also write a recording (.rrd).")] = None,
     picture: Annotated[Path | None, typer.Option(help="Also write a bird's-eye picture (.png).")] = None,
     method: MethodName = "ours",
+    solver: Solver = None,
     visualize: Visualize = False,
     arrows: Arrows = False,
     config: ConfigFile = None,
@@ -98,7 +101,7 @@ def pair(
     from lidarflow.config import load
     from lidarflow.types import ScanPair
 
-    settings, chosen = load(config, tuple(overrides or ())), methods.find(method)
+    settings, chosen = load(config, _with_solver(overrides, solver)), methods.find(method)
     for option, file, suffix in (("--out", out, ".npz"), ("--recording", recording, ".rrd"),
                                  ("--picture", picture, ".png")):
         if file is not None:
@@ -132,6 +135,7 @@ def run(
     n_scans: Count = None,
     jump: Jump = 0,
     method: MethodName = "ours",
+    solver: Solver = None,
     visualize: Visualize = False,
     arrows: Arrows = False,
     record: Annotated[bool, typer.Option(help="Write recording.rrd (about 5 MB a pair).")] = True,
@@ -143,7 +147,7 @@ def run(
     from lidarflow.config import load
     from lidarflow.runner import Viewing
 
-    settings = load(config, tuple(overrides or ()))
+    settings = load(config, _with_solver(overrides, solver))
     methods.find(method)
     dataset = _open(data, dataloader, sequence, settings)
     print(f"method     {method}")
@@ -294,6 +298,11 @@ def show_config() -> None:
     from lidarflow.tables import config_table
 
     _print(config_table())
+
+
+def _with_solver(overrides: list[str] | None, solver: str | None) -> tuple[str, ...]:
+    """The overrides of settings, and the one that --solver stands for."""
+    return (*(overrides or ()), *(() if solver is None else (f"solver.method={solver}",)))
 
 
 def _open(data: Path, dataloader: str | None, sequence: str | None, settings: "Config") -> "Dataset":

@@ -13,7 +13,7 @@ from lidarflow.lidar import dynamic, ego, features, frontend, mesh, preparation,
 from lidarflow.lidar import uncertainty as uncertainties
 from lidarflow.lidar.attribution import WORLD, Attribution, attribute
 from lidarflow.lidar.tracking import Tracks
-from lidarflow.solve import gtsam_lm
+from lidarflow.solve import solve
 from lidarflow.stopwatch import Stopwatch
 from lidarflow.types import FlowResult, Scan, ScanPair
 
@@ -143,15 +143,14 @@ def explain(prepared: Prepared, config: Config, tracks: Tracks) -> tuple[FlowRes
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
         by_group = np.concatenate([found.motions, ego_motion[None]])[found.owner]   # WORLD is the last
     with timed("solver"):
-        motions, solved, stats = gtsam_lm.solve(graph.problem, config.solver, config.graph.min_matches)
+        motions, solved, stats = solve(graph.problem, config.solver, config.graph.min_matches)
     with timed("refinement"):
         near_things, refined = _refined(prepared, _spread(by_group, graph, motions), found, config)
     with timed("dense answer"):
         dense = _spread(_spread(by_group, graph, motions), near_things, refined)
         flow = pose.apply(dense, points) - points
         in_graph = (graph.variable >= 0) | (near_things.variable >= 0)
-        is_solved = near_things.variable >= 0
-        is_solved[graph.rows[solved[graph.variable[graph.rows]]]] = True
+        is_solved = (near_things.variable >= 0) | np.append(solved, False)[graph.variable]
         is_dynamic = found.owner != WORLD
         if not config.objects.enabled:
             residual_flow = flow - (pose.apply(ego_motion, points) - points)
@@ -189,10 +188,10 @@ def _refined(
     if len(motions):
         surface = refinement.Surface.around(
             part.problem.points, pair.target.points, target.usable & ~target.ground, prepared.target_mesh)
-        solver = refinement.solver(config.solver, limits)
+        settings = refinement.solver(config.solver, limits)
         for _ in range(limits.rounds):
             problem = refinement.rematched(part.problem, motions, surface, limits.reach_m)
-            motions, _, _ = gtsam_lm.solve(problem, solver, config.graph.min_matches)
+            motions, _, _ = solve(problem, settings, config.graph.min_matches)
     return part, motions
 
 

@@ -9,10 +9,12 @@ import worlds
 
 from lidarflow import pose
 from lidarflow.config import SolverConfig
-from lidarflow.solve import gtsam_lm
+from lidarflow.solve import gtsam_lm, solve
 from lidarflow.types import FlowProblem
 
 CONFIG = SolverConfig()
+both_solvers = pytest.mark.parametrize("config", [
+    SolverConfig(method="gtsam"), SolverConfig(method="fast")], ids=["gtsam", "fast"])
 WORLD = pose.exp(np.array([0.01, -0.02, 0.03, -0.7, 0.1, 0.02]))
 
 
@@ -44,23 +46,26 @@ def test_the_tie_is_the_twist_from_the_group_to_the_point():
     assert isinstance(gtsam_lm._robust_tie_noise(CONFIG), gtsam.noiseModel.Robust)
 
 
-def test_noisy_matches_hardly_move_what_is_tied_to_the_world():
+@both_solvers
+def test_noisy_matches_hardly_move_what_is_tied_to_the_world(config):
     world = worlds.body((15.0, 3.0, 0.0), WORLD, rng(1), wrong_matches=0.3, noise_m=0.1)
-    free, _, _ = gtsam_lm.solve(world.problem, CONFIG, 3)
-    held, solved, stats = gtsam_lm.solve(tied(world.problem, np.zeros(len(free)), WORLD), CONFIG, 3)
+    free, _, _ = solve(world.problem, config, 3)
+    held, solved, stats = solve(tied(world.problem, np.zeros(len(free)), WORLD), config, 3)
     assert solved.all() and stats.solved_components == 1
     assert world.error_m(held).max() < 0.01
     assert world.error_m(held).mean() < 0.5 * world.error_m(free).mean()
 
 
-def test_a_group_of_minus_one_is_free():
+@both_solvers
+def test_a_group_of_minus_one_is_free(config):
     world = worlds.body((15.0, 3.0, 0.0), WORLD, rng(2), wrong_matches=0.1, noise_m=0.02)
-    free, _, _ = gtsam_lm.solve(world.problem, CONFIG, 3)
-    same, _, _ = gtsam_lm.solve(tied(world.problem, np.full(len(free), -1), np.eye(4)), CONFIG, 3)
+    free, _, _ = solve(world.problem, config, 3)
+    same, _, _ = solve(tied(world.problem, np.full(len(free), -1), np.eye(4)), config, 3)
     assert free.tobytes() == same.tobytes()
 
 
-def test_two_groups_on_one_mesh_keep_their_own_motions():
+@both_solvers
+def test_two_groups_on_one_mesh_keep_their_own_motions(config):
     """A foot on the kerb: the mesh joins them, the ties hold them apart."""
     world = worlds.body((10.0, 0.0, 0.0), WORLD, rng(3))
     points = world.problem.points
@@ -69,7 +74,7 @@ def test_two_groups_on_one_mesh_keep_their_own_motions():
     truth = np.where(on_object[:, None, None], car, WORLD)
     problem = replace(world.problem, match_target=pose.apply(truth, points), initial=truth)
     problem = tied(problem, on_object, WORLD, car)
-    motions, _, _ = gtsam_lm.solve(problem, CONFIG, 3)
+    motions, _, _ = solve(problem, config, 3)
     off_m = np.linalg.norm(pose.apply(motions, points) - pose.apply(truth, points), axis=1)
     assert np.median(off_m) < 0.02 and off_m.max() < 0.2
 

@@ -4,7 +4,6 @@ Every variable sits at its own point, X_i = τ_i · Trans(p_i), so that gtsam's 
 needed: a translation prior for a match, a between factor for two mesh neighbours.
 """
 
-from collections import Counter
 from dataclasses import dataclass
 
 import gtsam
@@ -12,19 +11,11 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import SolverConfig
+from lidarflow.solve import common
+from lidarflow.solve.common import Step
 from lidarflow.types import FlowProblem, SolveStats
 
 _EYE = gtsam.Rot3()
-
-
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """What one optimisation of one component did."""
-
-    iterations: int
-    initial_error: float
-    final_error: float
-    stopped: str
 
 
 def solve(
@@ -34,23 +25,20 @@ def solve(
 
     Components are independent problems (Dewan et al. 2016, section IV). Each is optimised first without,
     then with the truncated kernel (eq. 13). A component with fewer than `min_matches` matches, or whose
-    matches the kernel lets go until fewer are left, has no unique solution and keeps its start value.
+    matches the kernel lets go until fewer are left, has no unique solution and keeps its start value. Raises
+    SolveError for a problem with numbers that are not finite.
     """
-    motions = problem.initial.copy()
-    solved = np.zeros(len(problem.points), bool)
-    plain, robust, inliers = [], [], 0
+    common.require_finite(problem)
+    found = problem.initial.copy()
+    tried = common.matches_per_component(problem) >= max(min_matches, 1)
+    plain, robust = [], []
     for part in _components(problem):
-        if len(part.match_index) < min_matches:
+        if not tried[problem.component[part.rows[0]]]:
             continue
-        found, plain_step, robust_step = _solve_component(part, config)
+        found[part.rows], plain_step, robust_step = _solve_component(part, config)
         plain.append(plain_step)
         robust.append(robust_step)
-        kept = _inliers(part, found, config)
-        if kept >= min_matches:
-            motions[part.rows] = found
-            solved[part.rows] = True
-            inliers += kept
-    return motions, solved, _stats(problem, solved, plain, robust, inliers)
+    return common.concluded("gtsam", problem, found, tried, plain, robust, config, min_matches)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +80,7 @@ def _grouped(label: np.ndarray, count: int) -> list[np.ndarray]:
     return np.split(order, np.searchsorted(label[order], np.arange(1, count))) if count else []
 
 
-def _solve_component(part: _Component, config: SolverConfig) -> tuple[np.ndarray, _Step, _Step]:
+def _solve_component(part: _Component, config: SolverConfig) -> tuple[np.ndarray, Step, Step]:
     smoothness = _smoothness_factors(part, config)
     values = _values(part.initial, part.points)
     steps = []
@@ -179,40 +167,14 @@ def _sensor_frame_noise(point: np.ndarray, config: SolverConfig):
     return gtsam.noiseModel.Gaussian.Information(config.smoothness_weight * adjoint.T @ adjoint)
 
 
-def _optimise(graph, values, config: SolverConfig) -> tuple[gtsam.Values, _Step]:
+def _optimise(graph, values, config: SolverConfig) -> tuple[gtsam.Values, Step]:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(config.max_iterations)
     parameters.setRelativeErrorTol(config.relative_tolerance)
-    parameters.setAbsoluteErrorTol(1e-9)
+    parameters.setAbsoluteErrorTol(common.ABSOLUTE_TOLERANCE)
     initial_error = graph.error(values)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
     values = optimiser.optimize()
     iterations = optimiser.iterations()
-    stopped = "max_iterations" if iterations >= config.max_iterations else "converged"
-    return values, _Step(iterations, initial_error, optimiser.error(), stopped)
-
-
-def _inliers(part: _Component, motions: np.ndarray, config: SolverConfig) -> int:
-    """How many matches of the component the truncated kernel keeps."""
-    moved = pose.apply(motions[part.match_index], part.points[part.match_index])
-    off_sq = ((moved - part.match_target) ** 2).sum(axis=1)
-    return int((off_sq <= config.truncation_m**2).sum())
-
-
-def _stats(problem: FlowProblem, solved: np.ndarray, plain: list, robust: list, inliers: int) -> SolveStats:
-    return SolveStats(
-        solver="gtsam",
-        variables=len(problem.points),
-        matches=len(problem.match_index),
-        edges=len(problem.edges),
-        components=len(np.unique(problem.component)),
-        solved_components=len(np.unique(problem.component[solved])),
-        plain_iterations=sum(s.iterations for s in plain),
-        robust_iterations=sum(s.iterations for s in robust),
-        plain_initial_error=sum(s.initial_error for s in plain),
-        plain_final_error=sum(s.final_error for s in plain),
-        robust_initial_error=sum(s.initial_error for s in robust),
-        robust_final_error=sum(s.final_error for s in robust),
-        inliers=inliers,
-        stopped=dict(sorted(Counter(s.stopped for s in plain + robust).items())),
-    )
+    stopped = common.AT_LIMIT if iterations >= config.max_iterations else common.CONVERGED
+    return values, Step(iterations, initial_error, optimiser.error(), stopped)

@@ -1,0 +1,205 @@
+"""A hierarchy of ever coarser meshes, whose vertices are aggregates of points that move as one.
+
+Rigid motions of an aggregate cost no smoothness, and twists are all about the origin, so a coarse twist is
+that of all its points as it is, and the coarse equations are sums of the fine ones (Galerkin).
+
+All levels are in one list of nodes, level after level, and within each level component after component.
+"""
+
+from collections import namedtuple
+
+import numba
+import numpy as np
+
+from lidarflow.kernels.inertia import SIZE, add_at
+
+# bounds (L, C + 1): first node of every component on every level; the level after a component's last one
+# has no nodes of it. Neighbours of node i with higher numbers are up[up_start[i]:up_start[i + 1]], the edges
+# to them up_edge[…], which just counts; those with lower numbers are down[…], and down_edge[…]. parent (N,)
+# is the coarser node, edge_parent (E,) the coarser edge, -1 = none. stiffness is the weight of an edge.
+# lever (M, 3) is where an edge to a point from an earlier one sees twists. `weigh` fills the rest: inertias
+# (E', 10) of the edges beyond the first level, incident (N, 10) sums over the edges of a node.
+Hierarchy = namedtuple("Hierarchy", (
+    "bounds", "up_start", "up", "up_edge", "down_start", "down", "down_edge", "parent", "edge_parent",
+    "stiffness", "lever", "inertias", "incident"))
+
+
+def build(edges: np.ndarray, bounds: np.ndarray, stiffness: float) -> Hierarchy:
+    """Hierarchy of meshes with edges (E, 2), i < j, sorted; component c has the points bounds[c:c + 2]."""
+    up_start, up = _rows(edges, bounds[-1]), np.ascontiguousarray(edges[:, 1])
+    levels, all_bounds = [], [bounds]
+    while True:
+        down_start, down, down_edge = _reversed(up_start, up)
+        parent, coarse_bounds = _aggregates(up_start, up, down_start, down, all_bounds[-1])
+        coarse_start, coarse_up, edge_parent = _coarse_edges(
+            up_start, up, down_start, down, down_edge, parent, coarse_bounds[-1])
+        levels.append((up_start, up, down_start, down, down_edge, parent, edge_parent))
+        if coarse_bounds[-1] == 0:
+            return _flat(levels, all_bounds, stiffness)
+        up_start, up = coarse_start, coarse_up
+        all_bounds.append(coarse_bounds)
+
+
+def _flat(levels, all_bounds, stiffness) -> Hierarchy:
+    """One list of nodes of all levels."""
+    up_start, up, down_start, down, down_edge, parent, edge_parent = zip(*levels, strict=True)
+    node = np.cumsum([0] + [len(part) for part in parent])
+    edge = np.cumsum([0] + [len(part) for part in up])
+
+    def shifted(parts, firsts):
+        return np.concatenate([
+            np.where(part >= 0, part + first, -1) for part, first in zip(parts, firsts, strict=True)])
+
+    def starts(parts):
+        return np.append(shifted([part[:-1] for part in parts], edge[:-1]), edge[-1])
+
+    return Hierarchy(
+        np.stack([part + first for part, first in zip(all_bounds, node[:-1], strict=True)]),
+        starts(up_start), shifted(up, node[:-1]), np.arange(edge[-1], dtype=np.int32),
+        starts(down_start), shifted(down, node[:-1]), shifted(down_edge, edge[:-1]),
+        shifted(parent, node[1:]), shifted(edge_parent, edge[1:]), stiffness,
+        np.empty((node[1], 3)), np.empty((edge[-1] - edge[1], SIZE)), np.empty((node[-1], SIZE)))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def weigh(hierarchy, c):
+    """Fill the inertias of the edges of component c, and what they sum up to at its nodes, from `lever`."""
+    bounds, up_start, up = hierarchy.bounds, hierarchy.up_start, hierarchy.up
+    inertias, incident, edge_parent = hierarchy.inertias, hierarchy.incident, hierarchy.edge_parent
+    lever, stiffness, points_edges = hierarchy.lever, hierarchy.stiffness, len(up) - len(inertias)
+    for level in range(len(bounds)):
+        first, last = bounds[level, c], bounds[level, c + 1]
+        incident[first:last] = 0.0
+        if level > 0:
+            inertias[up_start[first] - points_edges:up_start[last] - points_edges] = 0.0
+    for i in range(bounds[0, c], bounds[0, c + 1]):
+        for e in range(up_start[i], up_start[i + 1]):
+            add_at(incident, i, lever, up[e], stiffness, stiffness)
+            add_at(incident, up[e], lever, up[e], stiffness, stiffness)
+            if edge_parent[e] >= 0:
+                add_at(inertias, edge_parent[e] - points_edges, lever, up[e], stiffness, stiffness)
+    for level in range(1, len(bounds)):
+        for i in range(bounds[level, c], bounds[level, c + 1]):
+            for e in range(up_start[i], up_start[i + 1]):
+                for k in range(SIZE):
+                    share = inertias[e - points_edges, k]
+                    incident[i, k] += share
+                    incident[up[e], k] += share
+                    if edge_parent[e] >= 0:
+                        inertias[edge_parent[e] - points_edges, k] += share
+
+
+@numba.njit(cache=True)
+def _rows(edges, count):
+    start = np.zeros(count + 1, np.int64)
+    for e in range(len(edges)):
+        start[edges[e, 0] + 1] += 1
+    return np.cumsum(start)
+
+
+@numba.njit(cache=True)
+def _reversed(up_start, up):
+    """For every node the neighbours with lower numbers, and the edges to them."""
+    count = len(up_start) - 1
+    start = np.zeros(count + 1, np.int64)
+    for e in range(len(up)):
+        start[up[e] + 1] += 1
+    start = np.cumsum(start)
+    filled = start[:-1].copy()
+    down, edge = np.empty(len(up), up.dtype), np.empty(len(up), np.int32)
+    for i in range(count):
+        for e in range(up_start[i], up_start[i + 1]):
+            slot = filled[up[e]]
+            down[slot], edge[slot] = i, e
+            filled[up[e]] += 1
+    return start, down, edge
+
+
+@numba.njit(cache=True)
+def _aggregates(up_start, up, down_start, down, bounds):
+    """Aggregate (N,) of every node, a node with all its neighbours where these are free, then what is left.
+
+    That is the first phase of Vanek, Mandel and Brezina 1996; what is left joins its first neighbour's. A
+    component without edges has no coarser level: -1. Also returns the bounds of components among aggregates.
+    """
+    parent = np.full(len(up_start) - 1, -1, np.int32)
+    coarse_bounds = np.zeros(len(bounds), bounds.dtype)
+    count = 0
+    for c in range(len(bounds) - 1):
+        first, last = bounds[c], bounds[c + 1]
+        coarse_bounds[c] = count
+        if up_start[first] == up_start[last]:
+            continue
+        for i in range(first, last):
+            free = parent[i] < 0
+            for e in range(up_start[i], up_start[i + 1]):
+                free = free and parent[up[e]] < 0
+            for e in range(down_start[i], down_start[i + 1]):
+                free = free and parent[down[e]] < 0
+            if not free:
+                continue
+            parent[i] = count
+            for e in range(up_start[i], up_start[i + 1]):
+                parent[up[e]] = count
+            for e in range(down_start[i], down_start[i + 1]):
+                parent[down[e]] = count
+            count += 1
+        for i in range(first, last):
+            if parent[i] < 0:
+                # An aggregate of the first phase: what joined in this one is told by its sign.
+                for e in range(down_start[i], down_start[i + 1]):
+                    if parent[i] == -1 and parent[down[e]] >= 0:
+                        parent[i] = -2 - parent[down[e]]
+                for e in range(up_start[i], up_start[i + 1]):
+                    if parent[i] == -1 and parent[up[e]] >= 0:
+                        parent[i] = -2 - parent[up[e]]
+        for i in range(first, last):
+            if parent[i] < -1:
+                parent[i] = -2 - parent[i]
+    coarse_bounds[-1] = count
+    return parent, coarse_bounds
+
+
+@numba.njit(cache=True)
+def _members(parent, count):
+    """Start (A + 1,) of every aggregate in the list of their members, and that list."""
+    start = np.zeros(count + 1, np.int64)
+    for i in range(len(parent)):
+        if parent[i] >= 0:
+            start[parent[i] + 1] += 1
+    start = np.cumsum(start)
+    filled, member = start[:-1].copy(), np.empty(start[-1], np.int32)
+    for i in range(len(parent)):
+        if parent[i] >= 0:
+            member[filled[parent[i]]] = i
+            filled[parent[i]] += 1
+    return start, member
+
+
+@numba.njit(cache=True)
+def _coarse_edges(up_start, up, down_start, down, down_edge, parent, count):
+    """Edges between aggregates as `up_start` and `up`, and which of them (E,) each edge is in, or -1."""
+    member_start, member = _members(parent, count)
+    start = np.zeros(count + 1, np.int64)
+    neighbour, edge_parent = np.empty(len(up), np.int32), np.full(len(up), -1, np.int32)
+    slot_of = np.full(count, -1, np.int64)
+    slots = 0
+    for a in range(count):
+        for k in range(member_start[a], member_start[a + 1]):
+            i = member[k]
+            ups = up_start[i + 1] - up_start[i]
+            for n in range(ups + down_start[i + 1] - down_start[i]):
+                if n < ups:
+                    edge = up_start[i] + n
+                    b = parent[up[edge]]
+                else:
+                    edge = down_edge[down_start[i] + n - ups]
+                    b = parent[down[down_start[i] + n - ups]]
+                if b <= a:
+                    continue
+                if slot_of[b] < start[a]:
+                    slot_of[b], neighbour[slots] = slots, b
+                    slots += 1
+                edge_parent[edge] = slot_of[b]
+        start[a + 1] = slots
+    return start, neighbour[:slots].copy(), edge_parent

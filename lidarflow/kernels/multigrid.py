@@ -1,0 +1,296 @@
+"""Normal equations of a pose graph, solved by conjugate gradients with a multigrid cycle before them.
+
+Unknown are twists, known are wrenches; see inertia.py and hierarchy.py. On the first level, an edge resists
+the twist between two points where the later one is, so that its share of a product is what the earlier
+point's twist is there (`seen`): sums over neighbours are plain sums.
+"""
+
+from collections import namedtuple
+
+import numba
+import numpy as np
+
+from lidarflow.kernels import inertia
+from lidarflow.kernels.rotations import cross
+
+# held (N, 10): inertia that holds each node where it is (matches, ties, damping); inverse (N, 10) of the sum
+# of that and of its edges; loads (N, 6) and twists (N, 6) of a cycle; seen (M, 6) of twists; then vectors of
+# the conjugate gradients, all (M, 6).
+Room = namedtuple("Room", (
+    "held", "inverse", "loads", "twists", "seen", "direction", "direction_seen", "product", "step"))
+
+
+def room_for(hierarchy) -> Room:
+    """Arrays that the solver works in."""
+    nodes, points = len(hierarchy.parent), len(hierarchy.lever)
+    sizes = ((nodes, inertia.SIZE),) * 2 + ((nodes, 6),) * 2 + ((points, 6),) * 5
+    return Room(*(np.empty(size) for size in sizes))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def levels_of(hierarchy, c):
+    """How many levels component c has."""
+    bounds = hierarchy.bounds
+    count = 1
+    while count < len(bounds) and bounds[count, c] < bounds[count, c + 1]:
+        count += 1
+    return count
+
+
+@numba.njit(cache=True, error_model="numpy")
+def hold(hierarchy, room, c, places, active, data_weight, tie_weight, damping):
+    """Fill `held` and `inverse` of component c, from the matches and ties that are `active` (M,)."""
+    bounds, parent, incident = hierarchy.bounds, hierarchy.parent, hierarchy.incident
+    held, inverse = room.held, room.inverse
+    levels = levels_of(hierarchy, c)
+    for level in range(levels):
+        held[bounds[level, c]:bounds[level, c + 1]] = 0.0
+    for i in range(bounds[0, c], bounds[0, c + 1]):
+        rotational = damping + tie_weight * (active[i] >> 1)
+        inertia.add_at(held, i, places, i, rotational + data_weight * (active[i] & 1), rotational)
+    for level in range(levels):
+        for i in range(bounds[level, c], bounds[level, c + 1]):
+            inertia.invert(incident, held, inverse, i)
+            if level + 1 < levels:
+                for k in range(inertia.SIZE):
+                    held[parent[i], k] += held[i, k]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _see(lever, i, ox, oy, oz, vx, vy, vz):
+    """What a unit inertia at a point's lever makes of a twist: a wrench about the origin."""
+    x, y, z = lever[i, 0], lever[i, 1], lever[i, 2]
+    ux, uy, uz = cross(ox, oy, oz, x, y, z)
+    ux, uy, uz = ux + vx, uy + vy, uz + vz
+    tx, ty, tz = cross(x, y, z, ux, uy, uz)
+    return ox + tx, oy + ty, oz + tz, ux, uy, uz
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sum(neighbours, start, end, rows):
+    """Sum of the rows (6,) of some neighbours."""
+    a = b = c = d = e = f = 0.0
+    for k in range(start, end):
+        j = neighbours[k]
+        a += rows[j, 0]
+        b += rows[j, 1]
+        c += rows[j, 2]
+        d += rows[j, 3]
+        e += rows[j, 4]
+        f += rows[j, 5]
+    return a, b, c, d, e, f
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _set(rows, i, a, b, c, d, e, f):
+    rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4], rows[i, 5] = a, b, c, d, e, f
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add(rows, i, a, b, c, d, e, f):
+    rows[i, 0] += a
+    rows[i, 1] += b
+    rows[i, 2] += c
+    rows[i, 3] += d
+    rows[i, 4] += e
+    rows[i, 5] += f
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _loaded(loads, i, s, a, b, c, d, e, f):
+    """The load of a node and what its neighbours add, times s."""
+    return (loads[i, 0] + s * a, loads[i, 1] + s * b, loads[i, 2] + s * c,
+            loads[i, 3] + s * d, loads[i, 4] + s * e, loads[i, 5] + s * f)
+
+
+# The arrays are taken out of their tuples in each of the sweeps: inner calls with them would copy it all.
+
+@numba.njit(cache=True, error_model="numpy")
+def _points_down(hierarchy, room, first, last):
+    """A Gauss-Seidel sweep from rest over points, in order; what is left becomes the next level's load."""
+    up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
+    lever, parent, s = hierarchy.lever, hierarchy.parent, hierarchy.stiffness
+    inverse, loads, twists, seen = room.inverse, room.loads, room.twists, room.seen
+    for i in range(first, last):
+        a, b, c, d, e, f = _sum(down, down_start[i], down_start[i + 1], twists)
+        a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
+        a, b, c, d, e, f = _loaded(loads, i, s, a, b, c, d, e, f)
+        a, b, c, d, e, f = inertia.twist(inverse, i, a, b, c, d, e, f)
+        _set(twists, i, a, b, c, d, e, f)
+        a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
+        _set(seen, i, a, b, c, d, e, f)
+    for i in range(first, last):
+        # Where point i was solved, the later ones were at rest: their pull is what is left.
+        a, b, c, d, e, f = _sum(up, up_start[i], up_start[i + 1], seen)
+        if parent[i] >= 0:
+            _add(loads, parent[i], s * a, s * b, s * c, s * d, s * e, s * f)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _points_up(hierarchy, room, first, last, correction):
+    """Add the coarser level's twists to those of points, then a Gauss-Seidel sweep in reversed order."""
+    up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
+    lever, parent, s = hierarchy.lever, hierarchy.parent, hierarchy.stiffness
+    inverse, loads, twists, seen = room.inverse, room.loads, room.twists, room.seen
+    for i in range(first, last):
+        for k in range(6):
+            twists[i, k] += correction * twists[parent[i], k]
+    for i in range(last - 1, first - 1, -1):
+        a, b, c, d, e, f = _sum(down, down_start[i], down_start[i + 1], twists)
+        a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
+        g, h, k, m, n, o = _sum(up, up_start[i], up_start[i + 1], seen)
+        a, b, c, d, e, f = _loaded(loads, i, s, a + g, b + h, c + k, d + m, e + n, f + o)
+        a, b, c, d, e, f = inertia.twist(inverse, i, a, b, c, d, e, f)
+        _set(twists, i, a, b, c, d, e, f)
+        a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
+        _set(seen, i, a, b, c, d, e, f)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pull(inertias, twists, edges, first_edge, neighbours, start, end):
+    """What the twists of some neighbours of a coarse node add to its load."""
+    a = b = c = d = e = f = 0.0
+    for slot in range(start, end):
+        j = neighbours[slot]
+        g, h, k, m, n, o = inertia.wrench(
+            inertias, edges[slot] - first_edge, twists[j, 0], twists[j, 1], twists[j, 2], twists[j, 3],
+            twists[j, 4], twists[j, 5])
+        a, b, c, d, e, f = a + g, b + h, c + k, d + m, e + n, f + o
+    return a, b, c, d, e, f
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _nodes_down(hierarchy, room, first, last):
+    """As `_points_down`, for the nodes of a coarser level."""
+    up_start, up, up_edge = hierarchy.up_start, hierarchy.up, hierarchy.up_edge
+    down_start, down, down_edge = hierarchy.down_start, hierarchy.down, hierarchy.down_edge
+    parent, inertias = hierarchy.parent, hierarchy.inertias
+    first_edge = len(up) - len(inertias)
+    inverse, loads, twists = room.inverse, room.loads, room.twists
+    for i in range(first, last):
+        a, b, c, d, e, f = _pull(
+            inertias, twists, down_edge, first_edge, down, down_start[i], down_start[i + 1])
+        a, b, c, d, e, f = _loaded(loads, i, 1.0, a, b, c, d, e, f)
+        a, b, c, d, e, f = inertia.twist(inverse, i, a, b, c, d, e, f)
+        _set(twists, i, a, b, c, d, e, f)
+    for i in range(first, last):
+        if parent[i] >= 0:
+            a, b, c, d, e, f = _pull(inertias, twists, up_edge, first_edge, up, up_start[i], up_start[i + 1])
+            _add(loads, parent[i], a, b, c, d, e, f)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _nodes_up(hierarchy, room, first, last, correction):
+    """As `_points_up`, for the nodes of a coarser level."""
+    up_start, up, up_edge = hierarchy.up_start, hierarchy.up, hierarchy.up_edge
+    down_start, down, down_edge = hierarchy.down_start, hierarchy.down, hierarchy.down_edge
+    parent, inertias = hierarchy.parent, hierarchy.inertias
+    first_edge = len(up) - len(inertias)
+    inverse, loads, twists = room.inverse, room.loads, room.twists
+    for i in range(first, last):
+        for k in range(6):
+            twists[i, k] += correction * twists[parent[i], k]
+    for i in range(last - 1, first - 1, -1):
+        a, b, c, d, e, f = _pull(
+            inertias, twists, down_edge, first_edge, down, down_start[i], down_start[i + 1])
+        g, h, k, m, n, o = _pull(inertias, twists, up_edge, first_edge, up, up_start[i], up_start[i + 1])
+        a, b, c, d, e, f = _loaded(loads, i, 1.0, a + g, b + h, c + k, d + m, e + n, f + o)
+        a, b, c, d, e, f = inertia.twist(inverse, i, a, b, c, d, e, f)
+        _set(twists, i, a, b, c, d, e, f)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def cycle(hierarchy, room, c, correction):
+    """One V-cycle: about the `twists` that the `loads` of the first level make of component c."""
+    bounds = hierarchy.bounds
+    levels = levels_of(hierarchy, c)
+    for level in range(levels):
+        if level + 1 < levels:
+            room.loads[bounds[level + 1, c]:bounds[level + 1, c + 1]] = 0.0
+        if level == 0:
+            _points_down(hierarchy, room, bounds[0, c], bounds[0, c + 1])
+        else:
+            _nodes_down(hierarchy, room, bounds[level, c], bounds[level, c + 1])
+    for level in range(levels - 2, 0, -1):
+        _nodes_up(hierarchy, room, bounds[level, c], bounds[level, c + 1], correction)
+    if levels > 1:
+        _points_up(hierarchy, room, bounds[0, c], bounds[0, c + 1], correction)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _multiply(hierarchy, room, first, last):
+    """Fill `product` with the normal equations times `direction`; returns direction · product."""
+    up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
+    lever, incident, s = hierarchy.lever, hierarchy.incident, hierarchy.stiffness
+    held, direction, seen, product = room.held, room.direction, room.direction_seen, room.product
+    total = 0.0
+    for i in range(first, last):
+        ox, oy, oz = direction[i, 0], direction[i, 1], direction[i, 2]
+        vx, vy, vz = direction[i, 3], direction[i, 4], direction[i, 5]
+        a, b, c, d, e, f = _sum(down, down_start[i], down_start[i + 1], direction)
+        a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
+        g, h, k, m, n, o = _sum(up, up_start[i], up_start[i + 1], seen)
+        a, b, c, d, e, f = s * (a + g), s * (b + h), s * (c + k), s * (d + m), s * (e + n), s * (f + o)
+        g, h, k, m, n, o = inertia.wrench(incident, i, ox, oy, oz, vx, vy, vz)
+        a, b, c, d, e, f = g - a, h - b, k - c, m - d, n - e, o - f
+        g, h, k, m, n, o = inertia.wrench(held, i, ox, oy, oz, vx, vy, vz)
+        a, b, c, d, e, f = a + g, b + h, c + k, d + m, e + n, f + o
+        _set(product, i, a, b, c, d, e, f)
+        total += ox * a + oy * b + oz * c + vx * d + vy * e + vz * f
+    return total
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _turn_direction(hierarchy, room, first, last, share):
+    """The next direction: the cycle's twists and a share of the last direction."""
+    lever, twists, direction, seen = hierarchy.lever, room.twists, room.direction, room.direction_seen
+    for i in range(first, last):
+        a, b, c = twists[i, 0], twists[i, 1], twists[i, 2]
+        d, e, f = twists[i, 3], twists[i, 4], twists[i, 5]
+        if share != 0.0:
+            a, b, c = a + share * direction[i, 0], b + share * direction[i, 1], c + share * direction[i, 2]
+            d, e, f = d + share * direction[i, 3], e + share * direction[i, 4], f + share * direction[i, 5]
+        _set(direction, i, a, b, c, d, e, f)
+        a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
+        _set(seen, i, a, b, c, d, e, f)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _dot(a, b, first, last):
+    total = 0.0
+    for i in range(first, last):
+        total += (a[i, 0] * b[i, 0] + a[i, 1] * b[i, 1] + a[i, 2] * b[i, 2]
+                  + a[i, 3] * b[i, 3] + a[i, 4] * b[i, 4] + a[i, 5] * b[i, 5])
+    return total
+
+
+@numba.njit(cache=True, error_model="numpy")
+def solve(hierarchy, room, c, gradient, tolerance, enough, most, correction):
+    """Fill `step` (M, 6) of component c with the twists that minimise the quadratic model of the energy.
+
+    Conjugate gradients, until an iteration gains less than `tolerance` of what all have gained, or `most`
+    iterations. Where less than `enough` seems to be there to gain, none is made. Returns how many were.
+    """
+    first, last = hierarchy.bounds[0, c], hierarchy.bounds[0, c + 1]
+    loads, step, direction, product = room.loads, room.step, room.direction, room.product
+    for i in range(first, last):
+        for k in range(6):
+            loads[i, k] = -gradient[i, k]
+            step[i, k] = 0.0
+    gain, last_square = 0.0, 1.0
+    for iteration in range(most):
+        cycle(hierarchy, room, c, correction)
+        square = _dot(loads, room.twists, first, last)
+        if not square > 0.0 or (iteration == 0 and 0.5 * square < enough):
+            return iteration
+        _turn_direction(hierarchy, room, first, last, square / last_square if iteration else 0.0)
+        length = square / _multiply(hierarchy, room, first, last)
+        for i in range(first, last):
+            for k in range(6):
+                step[i, k] += length * direction[i, k]
+                loads[i, k] -= length * product[i, k]
+        last_square = square
+        gain += 0.5 * length * square
+        if 0.5 * length * square <= tolerance * gain:
+            return iteration + 1
+    return most

@@ -1,0 +1,95 @@
+"""The pointwise factor graph solved by Levenberg-Marquardt with multigrid, all components at once.
+
+Energy, steps and stopping rule are those of gtsam_lm.py. A step of a variable is a twist ξ_i at the sensor's
+origin, τ_i ← τ_i Exp(ξ_i). Neighbours move nearly alike, so that the normal equations take the relative
+motion of neighbours as none: then they do not change from one iteration to the next, but for the matches
+that are let go. The energy and its gradient are exact, so the minimum is.
+"""
+
+import numba
+import numpy as np
+
+from lidarflow.config import SolverConfig
+from lidarflow.kernels import hierarchy, levenberg_marquardt, multigrid, pose_graph
+from lidarflow.solve import common
+from lidarflow.types import FlowProblem, SolveStats
+
+STEP_TOLERANCE = 0.03
+MAX_PRODUCTS = 50
+CORRECTION = 1.8
+
+
+def solve(
+    problem: FlowProblem, config: SolverConfig, min_matches: int
+) -> tuple[np.ndarray, np.ndarray, SolveStats]:
+    """Motions (M, 4, 4) of all variables, whether each was solved (M,), and what the solver did.
+
+    As gtsam_lm.solve. Raises SolveError for a problem with numbers that are not finite.
+    """
+    common.require_finite(problem)
+    tried = common.matches_per_component(problem) >= max(min_matches, 1)
+    found = problem.initial.copy()
+    figures = np.zeros((0, 2, levenberg_marquardt.FIGURES))
+    if tried.any():
+        figures = _optimise(problem, tried, config, found)
+    steps = [[common.Step(int(f[0]), f[1], f[2], common.AT_LIMIT if f[3] else common.CONVERGED) for f in rows]
+             for rows in (figures[:, 0].tolist(), figures[:, 1].tolist())]
+    return common.concluded("fast", problem, found, tried, *steps, config, min_matches)
+
+
+def _optimise(
+    problem: FlowProblem, tried: np.ndarray, config: SolverConfig, motions: np.ndarray
+) -> np.ndarray:
+    """Write the motions of the components `tried` (C,); returns figures (C', 2, FIGURES) of their steps."""
+    label = np.where(tried, np.cumsum(tried) - 1, -1)[problem.component]
+    rows = np.flatnonzero(label >= 0)
+    rows = rows[np.argsort(label[rows], kind="stable")]
+    place = np.full(len(label), -1, np.int32)
+    place[rows] = np.arange(len(rows), dtype=np.int32)
+    counts = np.bincount(label[rows], minlength=tried.sum())
+    bounds = np.concatenate([[0], np.cumsum(counts)])
+
+    edges = place[problem.edges]
+    edges = edges[edges[:, 0] >= 0]
+    edges = edges[np.argsort(edges[:, 0].astype(np.int64) * len(rows) + edges[:, 1])]
+    edge_bounds = np.searchsorted(edges[:, 0], bounds)
+    points = problem.points[rows]
+    factors = factors_of(problem, rows, place, points, edges, config)
+    levels = hierarchy.build(edges, bounds, config.smoothness_weight)
+    variables = pose_graph.variables_of(problem.initial[rows], points)
+    shares, share_bounds = _shares(counts)
+    limits = levenberg_marquardt.Limits(
+        config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE, STEP_TOLERANCE,
+        MAX_PRODUCTS, CORRECTION)
+    figures = levenberg_marquardt.optimise_each(
+        factors, levels, multigrid.room_for(levels), edge_bounds, shares, share_bounds, limits,
+        levenberg_marquardt.state_at(variables))
+    pose_graph.motions_of(variables, points, rows, motions)
+    return figures
+
+
+def factors_of(problem, rows, place, points, edges, config: SolverConfig) -> pose_graph.Factors:
+    matched, targets = np.zeros(len(rows), bool), np.zeros((len(rows), 3))
+    index = place[problem.match_index]
+    matched[index[index >= 0]] = True
+    targets[index[index >= 0]] = problem.match_target[index >= 0]
+    tied, ties = np.zeros(len(rows), bool), np.zeros((len(rows), 7))
+    if len(problem.group):
+        group = problem.group[rows]
+        tied = group >= 0
+        ties[tied] = pose_graph.variables_of(problem.group_motions[group[tied]], points[tied])
+    return pose_graph.Factors(
+        points, edges, matched, targets, tied, ties, config.smoothness_frame == "point", config.data_weight,
+        config.smoothness_weight, config.tie_weight, config.truncation_m**2, config.tie_truncation**2)
+
+
+def _shares(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Components for every thread, the largest first to whoever has least; who does which changes nothing."""
+    threads = numba.get_num_threads()
+    loads, shares = [0] * threads, [[] for _ in range(threads)]
+    for c in np.argsort(-counts, kind="stable").tolist():
+        thread = loads.index(min(loads))
+        loads[thread] += int(counts[c])
+        shares[thread].append(c)
+    return (np.concatenate([np.array(share, np.int64) for share in shares]),
+            np.cumsum([0] + [len(share) for share in shares]))

@@ -1,0 +1,213 @@
+"""The fast solver: its energy, gradient and normal equations, and how well it agrees with gtsam's."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+import worlds
+from energies import energy
+from numpy.testing import assert_allclose
+from shared_data import SHARED, needs_shared
+
+from lidarflow import config as settings
+from lidarflow import pipeline, pose
+from lidarflow.config import SolverConfig
+from lidarflow.datasets import open_dataset
+from lidarflow.kernels import pose_graph
+from lidarflow.solve import fast, gtsam_lm
+from lidarflow.types import ScanPair
+
+MIN_MATCHES = 3
+POINT = SolverConfig(data_weight=2.0, smoothness_weight=5.0)
+SENSOR = replace(POINT, smoothness_frame="sensor")
+both_frames = pytest.mark.parametrize("config", [POINT, SENSOR], ids=["point", "sensor"])
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def tied_world(seed: int, shift_m: float = 0.1, turn_deg: float = 2.0) -> worlds.World:
+    """A room with wrong matches whose variables start apart; half of them tied, a few of these to far off."""
+    world = worlds.moved_room(0.4, 2.0, rng(seed), wrong_matches=0.2, noise_m=0.02)
+    world = worlds.jittered(world, rng(seed + 1), shift_m, turn_deg)
+    count = len(world.motions)
+    group = np.where(np.arange(count) % 2, 0, -1).astype(np.int32)
+    group[:9:2] = 1
+    ties = np.stack([world.motions[0], world.motions[0] @ pose.from_translation([1.0, 0.0, 0.0])])
+    return replace(world, problem=replace(world.problem, group=group, group_motions=ties))
+
+
+def linearised(problem, config: SolverConfig, robust: bool):
+    """Energy and gradient (M, 6) at the start of a problem of one component, its factors and variables."""
+    count = len(problem.points)
+    edges = problem.edges[np.lexsort(problem.edges.T[::-1])]
+    factors = fast.factors_of(problem, np.arange(count), np.arange(count), problem.points, edges, config)
+    variables = pose_graph.variables_of(problem.initial, problem.points)
+    found, gradient = evaluated(factors, variables, variables[:, 4:].copy(), robust)
+    return found, gradient, factors, variables
+
+
+def evaluated(factors, variables, places, robust: bool):
+    """Energy and gradient (M, 6) of variables (M, 7)."""
+    count = len(variables)
+    gradient, active = np.empty((count, 6)), np.empty(count, np.uint8)
+    nodes, edges = (0, count), (0, len(factors.edges))
+    smooth = pose_graph.smoothness(factors, variables, places, nodes, edges, gradient)
+    return smooth + pose_graph.evidence(
+        factors, variables, places, nodes, robust, gradient, active), gradient
+
+
+# --- energy and derivatives ---
+
+@both_frames
+@pytest.mark.parametrize("robust", [False, True], ids=["plain", "robust"])
+@pytest.mark.parametrize(("shift_m", "turn_deg"), [(0.0, 0.0), (0.02, 0.5), (0.3, 40.0)])
+def test_the_energy_is_that_of_gtsams_graph(config, robust, shift_m, turn_deg):
+    problem = tied_world(0, shift_m, turn_deg).problem
+    part, = gtsam_lm._components(problem)
+    noises = ((gtsam_lm._robust_data_noise, gtsam_lm._robust_tie_noise) if robust
+              else (gtsam_lm._data_noise, gtsam_lm._tie_noise))
+    graph = gtsam.NonlinearFactorGraph(gtsam_lm._smoothness_factors(part, config))
+    graph.push_back(gtsam_lm._data_factors(part, noises[0](config)))
+    graph.push_back(gtsam_lm._tie_factors(part, noises[1](config)))
+    found, _, _, _ = linearised(problem, config, robust)
+    assert_allclose(found, graph.error(gtsam_lm._values(part.initial, part.points)), rtol=1e-10)
+
+
+@both_frames
+@pytest.mark.parametrize("robust", [False, True], ids=["plain", "robust"])
+@pytest.mark.parametrize(("shift_m", "turn_deg"), [(0.02, 0.5), (0.2, 40.0)])
+def test_the_gradient_is_the_numerical_one(config, robust, shift_m, turn_deg):
+    _, gradient, factors, variables = linearised(tied_world(2, shift_m, turn_deg).problem, config, robust)
+    places = variables[:, 4:].copy()
+    count = len(variables)
+    for seed in range(8):
+        twists = rng(seed).normal(size=(count, 6)) * [1.0, 1.0, 1.0, 0.3, 0.3, 0.3]
+        if seed < 4:
+            twists[rng(seed).permutation(count)[1:]] = 0.0
+        ends = []
+        for size in (1e-6, -1e-6):
+            moved = np.empty_like(variables)
+            pose_graph.step(variables, places, (0, count), size * twists, moved)
+            ends.append(evaluated(factors, moved, places, robust)[0])
+        assert_allclose((gradient * twists).sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-4, atol=1e-4)
+
+
+def test_wrenches_follow_their_places():
+    """The gradient for places elsewhere, moved to where the points are, is the one for places there."""
+    _, gradient, factors, variables = linearised(tied_world(3).problem, POINT, False)
+    places = variables[:, 4:] + rng(4).normal(size=(len(variables), 3))
+    _, elsewhere = evaluated(factors, variables, places, False)
+    assert np.abs(elsewhere - gradient).max() > 0.1
+    pose_graph.displace(places, variables, (0, len(variables)), elsewhere)
+    assert_allclose(elsewhere, gradient, atol=1e-9)
+
+
+def test_variables_give_back_the_motions():
+    random = rng(5)
+    points = random.normal(scale=30, size=(40, 3))
+    twists = random.normal(size=(40, 6))
+    twists[:12, :3] = np.pi * np.repeat(np.vstack([np.eye(3), -np.eye(3)]), 2, axis=0)   # half turns
+    motions = pose.exp(twists)
+    back = np.tile(np.eye(4), (40, 1, 1))
+    pose_graph.motions_of(pose_graph.variables_of(motions, points), points, np.arange(40), back)
+    assert_allclose(back, motions, atol=1e-11)
+
+
+# --- agreement with gtsam ---
+
+def assert_agreement(problem, config, min_matches=MIN_MATCHES, flow_rms_m=5e-3):
+    """Energy at most 0.1 % above gtsam's, the same components solved, and the flow within `flow_rms_m`."""
+    motions, solved, stats = gtsam_lm.solve(problem, config, min_matches)
+    found, found_solved, found_stats = fast.solve(problem, config, min_matches)
+    assert found_stats.robust_final_error <= 1.001 * stats.robust_final_error
+    assert (found_solved == solved).all() and pose.is_rigid(found)
+    apart = pose.apply(found, problem.points) - pose.apply(motions, problem.points)
+    assert np.sqrt((apart**2).sum(axis=1).mean()) < flow_rms_m
+    return found, found_stats
+
+
+@both_frames
+@pytest.mark.parametrize("wrong_matches", [0.0, 0.25])
+@pytest.mark.parametrize("turn_deg", [1.0, 8.0])
+def test_free_bodies_agree_with_gtsam(config, wrong_matches, turn_deg):
+    for seed in range(3):
+        bodies = [worlds.moved_room(0.6, turn_deg, rng(seed), wrong_matches, noise_m=0.03),
+                  *worlds.two_bodies(rng(10 + seed), wrong_matches, noise_m=0.03)]
+        problem = worlds.joined(bodies).problem
+        found, stats = assert_agreement(problem, config)
+        assert_allclose(stats.robust_final_error, energy(problem, found, config), rtol=1e-9)
+
+
+@both_frames
+def test_large_bodies_agree_with_gtsam(config):
+    """Large enough for four levels, few of the points matched."""
+    motion = pose.from_yaw(0.03, np.array([0.7, 0.1, 0.02]))
+    world = worlds.body((14.0, 3.0, 1.0), motion, rng(6), 0.15, noise_m=0.05, columns=60, rows=30)
+    few = np.sort(rng(7).permutation(1800)[:300])
+    problem = replace(world.problem, match_index=world.problem.match_index[few],
+                      match_target=world.problem.match_target[few])
+    assert_agreement(problem, config)
+
+
+@both_frames
+def test_tied_bodies_agree_with_gtsam(config):
+    for seed in range(3):
+        assert_agreement(tied_world(20 + seed).problem, config)
+
+
+@needs_shared
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["kitti_tracked_0005_from_000", "kitti_raw_0048", "argoverse2"])
+def test_scans_agree_with_gtsam(folder, monkeypatch):
+    config, seen = settings.Config(), []
+    dataset = open_dataset(SHARED / folder)
+    monkeypatch.setattr(pipeline, "solve", lambda *given: seen.append(given) or gtsam_lm.solve(*given))
+    pipeline.estimate_flow(ScanPair(dataset.scan(0), dataset.scan(1)), config)
+    (problem, solver, min_matches), = seen
+    assert len(problem.points) > 1000 and len(problem.group)
+    assert_agreement(problem, solver, min_matches)
+
+
+# --- the same bytes ---
+
+ANSWER = """
+import hashlib, sys
+import numpy as np
+import worlds
+from lidarflow.config import SolverConfig
+from lidarflow.solve import fast
+bodies = [w for seed in range(6) for w in worlds.two_bodies(np.random.default_rng(seed), 0.2, 0.05)]
+digest = hashlib.sha256()
+for frame in ("point", "sensor"):
+    motions, _, stats = fast.solve(worlds.joined(bodies).problem, SolverConfig(smoothness_frame=frame), 3)
+    digest.update(motions.tobytes() + repr(stats).encode())
+print(digest.hexdigest())
+"""
+
+
+def answer(threads: int, **environment: str) -> str:
+    """Digest of what a process of its own finds with so many threads."""
+    here = Path(__file__).resolve().parent
+    path = os.pathsep.join([str(here), str(here.parent), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", ANSWER], check=True, capture_output=True, text=True,
+        env={**os.environ, "NUMBA_NUM_THREADS": str(threads), "PYTHONPATH": path, **environment})
+    return done.stdout
+
+
+def test_the_number_of_threads_does_not_matter():
+    assert answer(1) == answer(2) == answer(3)
+
+
+@pytest.mark.slow
+def test_fresh_code_gives_what_cached_code_gives(tmp_path):
+    fresh = answer(1, NUMBA_CACHE_DIR=str(tmp_path))
+    assert any(tmp_path.rglob("*.nbc"))
+    assert fresh == answer(1, NUMBA_CACHE_DIR=str(tmp_path)) == answer(1)

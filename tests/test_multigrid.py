@@ -1,0 +1,166 @@
+"""The fast solver's kernels against slow twins: rotations, inertias, the hierarchy, and the linear solver."""
+
+import numpy as np
+import pytest
+import worlds
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from lidarflow import pose
+from lidarflow.kernels import hierarchy, inertia, multigrid, rotations
+
+DATA, TIE, DAMPING, STIFFNESS = 2.0, 7.0, 0.01, 3.0
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.19, 0.21, 1.0, 3.0, 3.1415])
+def test_rotations_match_scipy(angle):
+    first, second = Rotation.random(2, rng=rng(0))
+    vector = np.array([0.3, -1.2, 0.7])
+    x, y, z = rotations.turned(*first.as_quat(), *vector)
+    assert_allclose([x, y, z], first.apply(vector), atol=1e-14)
+    found = rotations.between(*first.as_quat(), *second.as_quat())
+    assert_allclose(found, (first.inv() * second).as_quat(canonical=True), atol=1e-14)
+
+    turn = angle * np.array([2.0, -1.0, 2.0]) / 3.0
+    *omega, c, slope = rotations.logarithm(*Rotation.from_rotvec(turn).as_quat(canonical=True))
+    assert_allclose(omega, turn, atol=1e-12)
+    jacobian = pose.exp(np.stack([[*turn, *axis] for axis in np.eye(3)]))[:, :3, 3].T
+    assert_allclose(rotations.inverse_jacobian(*omega, c, 1.0, *vector), np.linalg.solve(jacobian, vector),
+                    atol=1e-11)
+    assert_allclose(rotations.inverse_jacobian(*omega, c, -1.0, *vector),
+                    np.linalg.solve(jacobian.T, vector), atol=1e-11)
+    if 1e-3 < angle < 3.0:
+        ends = [rotations.logarithm(*Rotation.from_rotvec(turn * s).as_quat(canonical=True))[3]
+                for s in (1 + 1e-5, 1 - 1e-5)]
+        assert_allclose(slope, (ends[0] - ends[1]) / (4e-5 * angle**2), rtol=1e-4)
+
+
+def dense(numbers: np.ndarray) -> np.ndarray:
+    """The 6x6 matrix of an inertia (10,)."""
+    mass, moment, upper = numbers[0], pose.hat(numbers[1:4]), numbers[4:]
+    rotational = np.empty((3, 3))
+    rotational[np.triu_indices(3)] = rotational.T[np.triu_indices(3)] = upper
+    return np.block([[rotational, moment], [-moment, mass * np.eye(3)]])
+
+
+def at(place: np.ndarray, mass: float, against_rotation: float) -> np.ndarray:
+    """Matrix (6, 6) of what resists a twist at a place: Aᵀ diag(s, s, s, m, m, m) A, A = Ad(Trans(−q))."""
+    seen = pose.adjoint(pose.from_translation(-place))
+    return seen.T @ np.diag([against_rotation] * 3 + [mass] * 3) @ seen
+
+
+def test_inertias_are_blocks_of_the_normal_equations():
+    places = rng(1).normal(scale=10, size=(5, 3))
+    masses, rotational = rng(2).uniform(0.5, 3.0, 5), rng(3).uniform(0.0, 2.0, 5)
+    total = np.zeros((1, 10))
+    for k in range(5):
+        inertia.add_at(total, 0, places, k, masses[k], rotational[k])
+    expected = sum(at(*row) for row in zip(places, masses, rotational, strict=True))
+    assert_allclose(dense(total[0]), expected, atol=1e-10)
+    twist = rng(4).normal(size=6)
+    wrench = inertia.wrench(total, 0, *twist)
+    assert_allclose(wrench, expected @ twist, atol=1e-10)
+    inverse = np.empty((1, 10))
+    inertia.invert(total, np.zeros((1, 10)), inverse, 0)
+    assert_allclose(inertia.twist(inverse, 0, *wrench), twist, atol=1e-9)
+
+
+def meshes(*shapes):
+    """Points, sorted edges and bounds of several room grids."""
+    grids = [worlds.room_grid((9.0 + 3 * k, 2.0, 0.0), *shape) for k, shape in enumerate(shapes)]
+    bounds = np.cumsum([0] + [len(grid) for grid in grids])
+    edges = np.concatenate([
+        worlds.grid_edges(*shape) + first for shape, first in zip(shapes, bounds[:-1], strict=True)])
+    return np.concatenate(grids), edges[np.lexsort(edges.T[::-1])].astype(np.int32), bounds
+
+
+def prepared(at_sensor: bool, *shapes):
+    """A hierarchy with random evidence, ready to solve, and its dense normal equations of the points."""
+    points, edges, bounds = meshes(*shapes)
+    levels = hierarchy.build(edges, bounds, STIFFNESS)
+    levels.lever[:] = 0.1 * points if at_sensor else points
+    room = multigrid.room_for(levels)
+    active = rng(5).integers(0, 4, len(points)).astype(np.uint8)
+    for c in range(len(shapes)):
+        hierarchy.weigh(levels, c)
+        multigrid.hold(levels, room, c, points, active, DATA, TIE, DAMPING)
+    matrix = np.zeros((len(points), 6, len(points), 6))
+    for i, j in edges:
+        block = at(levels.lever[j], STIFFNESS, STIFFNESS)
+        for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            matrix[a, :, b] += sign * block
+    for i, point in enumerate(points):
+        tie = TIE * (active[i] >> 1) + DAMPING
+        matrix[i, :, i] += at(point, DATA * (active[i] & 1) + tie, tie)
+    return levels, room, matrix.reshape(6 * len(points), -1)
+
+
+def test_the_hierarchy_joins_neighbours_until_no_edge_is_left():
+    _, edges, bounds = meshes((40, 20), (5, 4), (2, 1), (1, 1))
+    levels = hierarchy.build(edges, bounds, STIFFNESS)
+    owner = np.full(len(levels.parent), -1)
+    for row in levels.bounds:
+        for c in range(len(bounds) - 1):
+            owner[row[c]:row[c + 1]] = c
+    assert (owner >= 0).all()
+    has_parent = levels.parent >= 0
+    assert (owner[levels.parent[has_parent]] == owner[has_parent]).all()
+    sizes = np.diff(levels.bounds, axis=1)
+    for c, size in enumerate(sizes.T):
+        count = multigrid.levels_of(levels, c)
+        assert (size[:count] > 0).all() and (size[count:] == 0).all() and size[count - 1] == 1
+        assert (size[1:count] <= 0.5 * size[:count - 1]).all()
+    assert multigrid.levels_of(levels, 3) == 1 and multigrid.levels_of(levels, 0) >= 4
+
+
+@pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
+def test_coarse_equations_are_sums_of_the_fine_ones(at_sensor):
+    levels, room, matrix = prepared(at_sensor, (9, 7), (4, 3))
+    first, second, third = (np.arange(row[0], row[-1]) for row in levels.bounds[:3])
+    for fine, coarse in ((first, second), (second, third)):
+        members = np.zeros((len(fine), len(coarse)))
+        kept = levels.parent[fine] >= 0
+        members[np.flatnonzero(kept), levels.parent[fine][kept] - coarse[0]] = 1.0
+        spread = np.kron(members, np.eye(6))
+        matrix = spread.T @ matrix @ spread
+        blocks = matrix.reshape(len(coarse), 6, len(coarse), 6)
+        expected = np.zeros_like(blocks)
+        edges_of_points = len(levels.up) - len(levels.inertias)
+        for i in coarse:
+            expected[i - coarse[0], :, i - coarse[0]] += dense(levels.incident[i] + room.held[i])
+            for e in range(levels.up_start[i], levels.up_start[i + 1]):
+                block = dense(levels.inertias[e - edges_of_points])
+                expected[i - coarse[0], :, levels.up[e] - coarse[0]] -= block
+                expected[levels.up[e] - coarse[0], :, i - coarse[0]] -= block
+        assert_allclose(blocks, expected, atol=1e-8 * np.abs(blocks).max())
+
+
+@pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
+def test_the_cycle_is_a_symmetric_preconditioner(at_sensor):
+    levels, room, matrix = prepared(at_sensor, (12, 7))
+    count = len(matrix) // 6
+    columns = []
+    for k in range(6 * count):
+        room.loads[:count] = np.eye(6 * count)[k].reshape(-1, 6)
+        multigrid.cycle(levels, room, 0, 1.0)
+        columns.append(room.twists[:count].ravel().copy())
+    inverse = np.stack(columns, axis=1)
+    assert_allclose(inverse, inverse.T, atol=1e-9 * np.abs(inverse).max())
+    shares = np.linalg.eigvals(inverse @ matrix).real
+    assert shares.min() > 0.03 and shares.max() < 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
+def test_steps_solve_the_normal_equations(at_sensor):
+    levels, room, matrix = prepared(at_sensor, (16, 9), (3, 3), (1, 1))
+    count = len(matrix) // 6
+    gradient = rng(6).normal(size=(count, 6))
+    for c in range(3):
+        assert multigrid.solve(levels, room, c, gradient, 1e-24, 0.0, 200, 1.8) < 60
+    expected = -np.linalg.solve(matrix, gradient.ravel()).reshape(-1, 6)
+    assert_allclose(room.step, expected, atol=1e-7 * np.abs(expected).max())
+    assert multigrid.solve(levels, room, 0, gradient, 1e-24, 1e9, 200, 1.8) == 0   # not enough to gain
