@@ -11,7 +11,18 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from lidarflow import pose
-from lidarflow.kernels import directions, grid, ground_plane, icp, linalg, links, misfit, tree, votes
+from lidarflow.kernels import (
+    directions,
+    grid,
+    ground_plane,
+    icp,
+    linalg,
+    links,
+    misfit,
+    registration,
+    tree,
+    votes,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -310,6 +321,30 @@ def check_solve_positive4(count: int) -> None:
         np.testing.assert_allclose(solution, np.linalg.solve(root @ root.T, right), rtol=1e-6, atol=1e-9)
 
 
+def check_registration_equations(count: int) -> None:
+    cloud, normal = rng(30).uniform(-2, 2, (count, 3)), rng(31).normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal[::7] = np.nan
+    target = tree.build(cloud)
+    ordered = np.ascontiguousarray(normal[target.rows])
+    points, reach_m = rng(32).uniform(-2, 2, (2 * count, 3)), 0.4
+    pairs = registration.Pairs(len(points))
+    for step in range(3):   # pairs are kept from round to round
+        motion = pose.exp(0.02 * step * np.ones(6))
+        found = registration.normal_equations(points, motion, target, ordered, reach_m, pairs)
+        moved = pose.apply(motion, points)
+        apart = np.linalg.norm(moved[:, None] - cloud[None], axis=2)
+        nearest = apart.argmin(axis=1)
+        paired = (apart.min(axis=1) < reach_m) & np.isfinite(normal[nearest, 0])
+        n, x = normal[nearest[paired]], moved[paired]
+        off_m = ((cloud[nearest[paired]] - x) * n).sum(axis=1)
+        weight = (1 - (off_m / reach_m) ** 2) ** 2
+        rows = np.hstack([np.cross(x, n), n])
+        np.testing.assert_allclose(found[0], (weight[:, None] * rows).T @ rows, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found[1], rows.T @ (weight * off_m), rtol=1e-9, atol=1e-12)
+        assert found[2] == paired.sum() > 0
+
+
 def check_all_tiny() -> None:
     """Every comparison on tiny inputs, for interpreted kernels."""
     check_tree(60)
@@ -325,6 +360,11 @@ def check_all_tiny() -> None:
     check_onto_points(20)
     check_onto_planes(20, 20)
     check_solve_positive4(2)
+    check_registration_equations(40)
+
+
+def test_registration_equations():
+    check_registration_equations(900)
 
 
 def test_tree():

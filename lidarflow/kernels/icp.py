@@ -49,7 +49,7 @@ def _onto_points(points, target, translation, gates_m, rounds_per_gate, motion):
                 x = cosine * ax - sine * ay + centre[0] + shift[0]
                 y = sine * ax + cosine * ay + centre[1] + shift[1]
                 z = az + centre[2] + shift[2]
-                near, _ = _follow(target, x, y, z, gate_m, i, place, asked, clear_m)
+                near, _ = follow(target, x, y, z, gate_m, i, place, asked, clear_m)
                 if near < 0:
                     continue
                 at = target.points[near]
@@ -134,7 +134,7 @@ def _add_pairs(
         dx, dy, dz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         tx, ty = cosine * dx - sine * dy, sine * dx + cosine * dy
         x, y, z = tx + centre[0] + shift[0], ty + centre[1] + shift[1], dz + centre[2] + shift[2]
-        near, apart_sq = _follow(target, x, y, z, gate_m, i, place, asked, clear_m)
+        near, apart_sq = follow(target, x, y, z, gate_m, i, place, asked, clear_m)
         if near < 0:
             continue
         count += 1
@@ -174,7 +174,7 @@ def _add_pairs(
 
 
 @numba.njit(cache=True)
-def _follow(target, x, y, z, gate_m, i, place, asked, clear_m):
+def follow(target, x, y, z, gate_m, i, place, asked, clear_m):
     """Nearest place to x, y, z within the gate, -1 without one, and its squared distance, for point i.
 
     place (N,) was nearest when the point was at asked (N, 3), and nothing else was within clear_m (N,). While

@@ -7,18 +7,19 @@ from lidarflow.config import Config, EgoConfig
 from lidarflow.errors import DataError
 from lidarflow.lidar import preparation
 from lidarflow.lidar.registration import (
+    Planes,
     overlap,
     reproducible,
     robust_point_to_plane,
     thinned,
     voxel_for,
-    with_normals,
 )
 
 # Coarse to fine: how far apart corresponding surfaces may be, in voxels. With voxels of 0.2 m the first stage
 # reaches 4 m, the motion of a 10 Hz sensor at 40 m/s, and the last 0.15 m.
 _STAGES_VOXELS = (20.0, 7.5, 3.0, 1.5, 0.75)
 _COARSE_VOXELS = 5.0         # the first stage works on a cloud thinned this much more
+_GUESS_OFF_M = 0.6           # KISS-ICP is nearer than this
 _MIN_OVERLAP = 0.3           # of the source within the third stage's reach of the target, at the end
 
 
@@ -30,7 +31,7 @@ def find(source: np.ndarray, target: np.ndarray, guess: np.ndarray | None, confi
     """
     found = guess
     if guess is None or config.refine:
-        found = register(source, target, guess, config)
+        found = register(source, target, guess, config, np.inf if guess is None else _GUESS_OFF_M)
     return reproducible(found)
 
 
@@ -45,11 +46,11 @@ def register(
     little in common.
     """
     voxel_m = voxel_for(source, config.voxel_m)
-    fine = thinned(source, voxel_m), with_normals(thinned(target, voxel_m), voxel_m)
+    fine = _thinned(source, voxel_m), Planes.of(_thinned(target, voxel_m), voxel_m)
     target_from_source = start
     if start is None:
         coarse_m = _COARSE_VOXELS * voxel_m
-        coarse = thinned(source, coarse_m), with_normals(thinned(target, coarse_m), coarse_m)
+        coarse = _thinned(source, coarse_m), Planes.of(_thinned(target, coarse_m), coarse_m)
         target_from_source = robust_point_to_plane(*coarse, _STAGES_VOXELS[0] * voxel_m, np.eye(4))
     reaches_m = [reach_voxels * voxel_m for reach_voxels in _STAGES_VOXELS[1:]]
     for reach_m in [reach_m for reach_m in reaches_m if reach_m <= start_off_m] or reaches_m[-1:]:
@@ -58,10 +59,16 @@ def register(
     return target_from_source
 
 
-def _require_overlap(source, target, reach_m: float, target_from_source: np.ndarray) -> None:
+def _thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
+    return np.asarray(thinned(points, voxel_m).points)
+
+
+def _require_overlap(
+    source: np.ndarray, target: Planes, reach_m: float, target_from_source: np.ndarray
+) -> None:
     """Raise DataError unless the motion is rigid and brings the clouds together."""
     is_rigid = pose.is_rigid(target_from_source, tolerance=1e-4)
-    found = overlap(source, target, reach_m, target_from_source) if is_rigid else 0.0
+    found = overlap(source, target.tree, reach_m, target_from_source) if is_rigid else 0.0
     if found < _MIN_OVERLAP:
         raise DataError(
             f"ego-motion: {found:.0%} of the first scan comes within {reach_m:.2g} m of the second, at "

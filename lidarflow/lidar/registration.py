@@ -1,16 +1,22 @@
-"""Registration of two clouds with Open3D: what ego-motion and the baselines have in common."""
+"""Registration of two clouds: what ego-motion and the baselines have in common."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from lidarflow import pose
 from lidarflow.errors import DataError
+from lidarflow.kernels import normals, tree
+from lidarflow.kernels import registration as kernel
+from lidarflow.kernels.tree import Tree
 from lidarflow.open3d_import import open3d
 
 _SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range: indoors all is smaller
 _NORMAL_RADIUS_VOXELS = 5.0
-_NORMAL_NEIGHBOURS = 40
 _MIN_POINTS = 30
-_SETTLED = 1e-7              # relative change of fit and residual that ends an ICP
+_SETTLED = 1e-7              # relative change of fit and residual that ends a point-to-point ICP
+_MOST_ROUNDS = 30
+_HOLD = 1e-9
 _REPRODUCIBLE_DECIMALS = 9
 
 
@@ -33,18 +39,40 @@ def thinned(points: np.ndarray, voxel_m: float):
     return cloud
 
 
-def with_normals(cloud, voxel_m: float):
-    """`cloud`, thinned to `voxel_m`, with a normal per point."""
-    search = open3d().geometry.KDTreeSearchParamHybrid(_NORMAL_RADIUS_VOXELS * voxel_m, _NORMAL_NEIGHBOURS)
-    cloud.estimate_normals(search)
-    return cloud
+@dataclass(frozen=True, slots=True, eq=False)
+class Planes:
+    """A cloud as a tree, with a normal (N, 3) per point in the tree's order; NaN where there is none."""
+
+    tree: Tree
+    normals: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, voxel_m: float) -> "Planes":
+        """Of points (N, 3) in metres, thinned to `voxel_m`."""
+        grown = tree.build(points)
+        return cls(grown, normals.estimate(grown.points, grown.points, _NORMAL_RADIUS_VOXELS * voxel_m))
 
 
-def robust_point_to_plane(source, target, reach_m: float, start: np.ndarray) -> np.ndarray:
-    """target_from_source (4, 4) from `start` (4, 4); Tukey's loss, `reach_m` wide, lets moving objects go."""
-    registration = open3d().pipelines.registration
-    method = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(reach_m))
-    return _icp(source, target, reach_m, start, method, iterations=50)
+def robust_point_to_plane(
+    source: np.ndarray, target: Planes, reach_m: float, start: np.ndarray, settled: float = 1e-5
+) -> np.ndarray:
+    """target_from_source (4, 4) of points (N, 3) from `start` (4, 4), by Gauss-Newton steps.
+
+    Tukey's loss, `reach_m` wide, lets moving objects go. It ends when a step stays below `settled`, in metres
+    and radians.
+    """
+    motion, pairs = start, kernel.Pairs(len(source))
+    for _ in range(_MOST_ROUNDS):
+        matrix, right, count = kernel.normal_equations(
+            source, motion, target.tree, target.normals, reach_m, pairs)
+        if count < _MIN_POINTS:
+            break
+        # What no plane holds, as in a corridor, is left where it is.
+        step = np.linalg.solve(matrix + _HOLD * np.trace(matrix) * np.eye(6), right)
+        motion = pose.exp(step) @ motion
+        if np.abs(step).max() < settled:
+            break
+    return motion
 
 
 def point_to_point(source, target, reach_m: float, start: np.ndarray) -> np.ndarray:
@@ -53,10 +81,10 @@ def point_to_point(source, target, reach_m: float, start: np.ndarray) -> np.ndar
     return _icp(source, target, reach_m, start, method, iterations=100)
 
 
-def overlap(source, target, reach_m: float, target_from_source: np.ndarray) -> float:
-    """Share of the source that comes within `reach_m` of the target."""
-    registration = open3d().pipelines.registration
-    return registration.evaluate_registration(source, target, reach_m, target_from_source).fitness
+def overlap(source: np.ndarray, target: Tree, reach_m: float, target_from_source: np.ndarray) -> float:
+    """Share of the source (N, 3) that comes within `reach_m` of the target."""
+    distance_m, _ = tree.query(target, pose.apply(target_from_source, source), reach_m)
+    return float(np.isfinite(distance_m).mean())
 
 
 def reproducible(motion: np.ndarray) -> np.ndarray:
