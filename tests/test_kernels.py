@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarflow.kernels import coherence, grid, linalg, matching, mesh, normals, shot
+from lidarflow.kernels import coherence, graphs, grid, linalg, matching, mesh, normals, shot
 
 RADIUS_M = 1.0
 
@@ -302,6 +302,23 @@ def check_ring_strips(rings: int, columns: int) -> None:
         assert np.linalg.norm(points[opened[:, i]] - points[opened[:, j]], axis=1).max() <= 0.9
 
 
+def check_graphs(count: int) -> None:
+    triangles = np.array([rng(k).choice(count, 3, replace=False) for k in range(count // 2)], np.int32)
+    edges = graphs.sides(triangles, count)
+    wanted = {(min(a, b), max(a, b)) for t in triangles.tolist()
+              for a, b in ((t[0], t[1]), (t[1], t[2]), (t[0], t[2]))}
+    assert list(map(tuple, edges.tolist())) == sorted(wanted)
+    few = edges[: len(edges) // 3]
+    label = list(range(count))
+    for _ in range(count):
+        for a, b in few.tolist():
+            label[a] = label[b] = min(label[a], label[b])
+    _, expected = np.unique(label, return_inverse=True)
+    np.testing.assert_array_equal(graphs.components(few, count), expected)
+    assert len(graphs.sides(triangles[:0], 5)) == 0
+    np.testing.assert_array_equal(graphs.components(edges[:0], 3), [0, 1, 2])
+
+
 def check_ring_edges(count: int) -> None:
     points = rng(9).uniform(-1, 1, (count, 3)) + [6.0, 0.0, 0.0]
     ring, wanted = rng(10).integers(0, 3, count), rng(11).random(count) < 0.5
@@ -344,6 +361,7 @@ def check_all_tiny() -> None:
     check_matching(40)
     check_ring_strips(3, 60)
     check_ring_edges(60)
+    check_graphs(30)
     check_tangent_stars(150)
 
 
@@ -424,6 +442,10 @@ def test_best_in_gate():
 
 def test_ring_strips():
     check_ring_strips(6, 90)
+
+
+def test_graphs():
+    check_graphs(120)
 
 
 def test_ring_edges():

@@ -28,7 +28,7 @@ class Pairs:
 def normal_equations(points, motion, target, target_normals, reach_m, pairs: Pairs):
     """Matrix (6, 6) and right side (6,) of one Gauss-Newton step, and how many points it rests on.
 
-    The step is a twist (rotation first) to be applied after `motion` (4, 4); it lowers Σ ρ(n · (T p − q)) over
+    The step is a twist (rotation first) to be applied after `motion` (4, 4); it lowers Σ ρ(n · (T p − q)) of
     points p (N, 3) whose nearest q in the tree `target` is within `reach_m`. ρ is Tukey's, as wide as the
     reach, n of target_normals (M, 3) in the order of the tree, NaN where there is none.
     """

@@ -3,13 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from lidarflow.config import MeshConfig
 from lidarflow.errors import DataError
+from lidarflow.kernels import graphs, normals
 from lidarflow.kernels import mesh as kernel
-from lidarflow.kernels import normals
 from lidarflow.lidar import rings
 
 # Marton et al. 2009 ask for angles of 10 to 120 degrees; scan lines lie farther apart than points along
@@ -54,15 +52,17 @@ def build(
         method = "tangent"
         triangles = _tangent_triangles(points, kept, surface, config, normal_radius_m)
     else:
-        method, triangles = "grid", _grid_triangles(points, kept, ring, config)
-    edges = unique_edges(triangles)
+        azimuth = np.arctan2(points[:, 1], points[:, 0])
+        order = _by_ring(azimuth, np.flatnonzero(kept & (ring >= 0)), ring)
+        method, triangles = "grid", _grid_triangles(points, azimuth, order, ring, config)
+    edges = graphs.sides(triangles, len(points))
     if ring is not None:
-        edges = _with_ring_edges(edges, points, kept, ring, config)
-    return Mesh(triangles, edges, components(edges, len(points)), method)
+        edges = _with_ring_edges(edges, points, order, ring, config)
+    return Mesh(triangles, edges, graphs.components(edges, len(points)), method)
 
 
 def _grid_triangles(
-    points: np.ndarray, kept: np.ndarray, ring: np.ndarray, config: MeshConfig
+    points: np.ndarray, azimuth: np.ndarray, order: np.ndarray, ring: np.ndarray, config: MeshConfig
 ) -> np.ndarray:
     """Strips between neighbouring rings, then across whatever stands between the two ends of a surface.
 
@@ -72,20 +72,18 @@ def _grid_triangles(
     an arm held away from the body, it lies beside the wall on the next ring; what no strip wanted gets
     strips by itself.
     """
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    rows = np.flatnonzero(kept & (ring >= 0))
     limits = _limits(config, config.max_edge_rings * _ring_spacing(points, ring))
-    triangles = _strips(points, azimuth, rows, ring, limits)
+    triangles = _strips(points, azimuth, order, ring, limits)
     meshed = np.zeros(len(points), bool)
     meshed[triangles.ravel()] = True
     triangles = np.concatenate([
-        triangles, _strips(points, azimuth, rows[meshed[rows]], ring, limits),
-        _strips(points, azimuth, rows[~meshed[rows]], ring, limits)])
+        triangles, _strips(points, azimuth, order[meshed[order]], ring, limits),
+        _strips(points, azimuth, order[~meshed[order]], ring, limits)])
 
-    component = components(unique_edges(triangles), len(points))
+    component = graphs.components(graphs.sides(triangles, len(points)), len(points))
     is_fragment = np.bincount(component)[component] < _FRAGMENT_POINTS
     across = [
-        _strips(points, azimuth, rows[ring[rows] % step == phase], ring // step, limits)
+        _strips(points, azimuth, order[ring[order] % step == phase], ring // step, limits)
         for step in (2, 3) for phase in range(step)
     ]
     across = np.concatenate(across)
@@ -93,16 +91,15 @@ def _grid_triangles(
 
 
 def _with_ring_edges(
-    edges: np.ndarray, points: np.ndarray, kept: np.ndarray, ring: np.ndarray, config: MeshConfig
+    edges: np.ndarray, points: np.ndarray, order: np.ndarray, ring: np.ndarray, config: MeshConfig
 ) -> np.ndarray:
     """`edges` (E, 2) and those along rings to points without any: a level arm is seen by one ring only."""
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    rows = np.flatnonzero(kept & (ring >= 0))
-    order, bounds = _by_ring(azimuth, rows, ring)
     lone = np.ones(len(points), bool)
     lone[edges.ravel()] = False
-    along = kernel.ring_edges(points, order, bounds, lone, *_limits(config, max_edge_rad=0.0))
-    return np.unique(np.concatenate([edges, along]), axis=0)
+    along = kernel.ring_edges(
+        points, order, _bounds(ring[order]), lone, *_limits(config, max_edge_rad=0.0))
+    edges = np.concatenate([edges, along])
+    return edges[np.argsort(edges[:, 0] * np.int64(len(points)) + edges[:, 1], kind="stable")]
 
 
 def _ring_spacing(points: np.ndarray, ring: np.ndarray) -> float:
@@ -116,15 +113,20 @@ def _ring_spacing(points: np.ndarray, ring: np.ndarray) -> float:
 
 
 def _strips(
-    points: np.ndarray, azimuth: np.ndarray, rows: np.ndarray, ring: np.ndarray, limits: tuple
+    points: np.ndarray, azimuth: np.ndarray, order: np.ndarray, ring: np.ndarray, limits: tuple
 ) -> np.ndarray:
-    return kernel.ring_strips(points, azimuth, *_by_ring(azimuth, rows, ring), *limits)
+    return kernel.ring_strips(points, azimuth, order, _bounds(ring[order]), *limits)
 
 
-def _by_ring(azimuth: np.ndarray, rows: np.ndarray, ring: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`rows` (P,) ring by ring with azimuth ascending, and where each ring begins in them (R + 1,)."""
-    order = rows[np.lexsort((azimuth[rows], ring[rows]))]
-    return order, np.searchsorted(ring[order], np.arange(ring.max() + 2))
+def _by_ring(azimuth: np.ndarray, rows: np.ndarray, ring: np.ndarray) -> np.ndarray:
+    """`rows` (P,) ring by ring with azimuth ascending."""
+    # One key, so that a sort that knows runs finds those of the file.
+    return rows[np.argsort(ring[rows] * 8.0 + azimuth[rows], kind="stable")]
+
+
+def _bounds(ring: np.ndarray) -> np.ndarray:
+    """Where each of R rings begins in ascending rings (P,), and the end: (R + 1,)."""
+    return np.searchsorted(ring, np.arange(ring[-1] + 2 if len(ring) else 1))
 
 
 def _tangent_triangles(
@@ -143,18 +145,3 @@ def _tangent_triangles(
 def _limits(config: MeshConfig, max_edge_rad: float) -> tuple[float, float, float, float]:
     """What the kernels call continuous; edges may be longer than max_edge_m where max_edge_rad says so."""
     return config.max_edge_m, max_edge_rad, config.max_depth_jump_m, np.radians(config.min_grazing_deg)
-
-
-def unique_edges(triangles: np.ndarray) -> np.ndarray:
-    """Edges (E, 2) int32, i < j, sorted and unique, of triangles (T, 3)."""
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
-    sides = np.sort(sides, axis=1).astype(np.int64)
-    n = np.int64(sides.max()) + 1 if len(sides) else np.int64(1)
-    keys = np.unique(sides[:, 0] * n + sides[:, 1])
-    return np.stack([keys // n, keys % n], axis=1).astype(np.int32)
-
-
-def components(edges: np.ndarray, count: int) -> np.ndarray:
-    """Component (count,) int32 of each of `count` points joined by edges (E, 2)."""
-    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.int32)

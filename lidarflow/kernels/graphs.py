@@ -1,0 +1,68 @@
+"""Undirected graphs as edge lists: unique edges of triangles, connected components."""
+
+import numba
+import numpy as np
+
+
+def sides(triangles: np.ndarray, count: int) -> np.ndarray:
+    """Edges (E, 2) int32, i < j, sorted and unique, of triangles (T, 3) over `count` points."""
+    return _sides(np.ascontiguousarray(triangles), count)
+
+
+def components(edges: np.ndarray, count: int) -> np.ndarray:
+    """Component (count,) int32 of points joined by edges (E, 2), numbered by their first points."""
+    return _components(np.ascontiguousarray(edges), count)
+
+
+@numba.njit(cache=True)
+def _sides(triangles, count):
+    first = np.zeros(count + 1, np.int64)    # of the edges of each lower end, later: where the next one goes
+    for t in range(len(triangles)):
+        for k in range(3):
+            first[min(triangles[t, k], triangles[t, (k + 1) % 3]) + 1] += 1
+    for i in range(count):
+        first[i + 1] += first[i]
+    upper, place = np.empty(3 * len(triangles), np.int32), first[:-1].copy()
+    for t in range(len(triangles)):
+        for k in range(3):
+            a, b = triangles[t, k], triangles[t, (k + 1) % 3]
+            i, j = min(a, b), max(a, b)
+            upper[place[i]] = j
+            place[i] += 1
+    edges, found = np.empty((len(upper), 2), np.int32), 0
+    for i in range(count):
+        own = upper[first[i]: first[i + 1]]
+        own.sort()
+        for k in range(len(own)):
+            if k == 0 or own[k] != own[k - 1]:
+                edges[found, 0], edges[found, 1] = i, own[k]
+                found += 1
+    return edges[:found].copy()
+
+
+@numba.njit(cache=True)
+def _components(edges, count):
+    parent = np.arange(count)
+    for e in range(len(edges)):
+        a, b = _root(parent, edges[e, 0]), _root(parent, edges[e, 1])
+        if a < b:
+            parent[b] = a
+        else:
+            parent[a] = b
+    label, found = np.empty(count, np.int32), 0
+    for i in range(count):   # a root is the first of its component
+        root = _root(parent, i)
+        if root == i:
+            label[i] = found
+            found += 1
+        else:
+            label[i] = label[root]
+    return label
+
+
+@numba.njit(cache=True, inline="always")
+def _root(parent, i):
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
