@@ -432,3 +432,12 @@ def test_ctrl_c_is_one_line_and_leaves_only_whole_files(scans, tmp_path):
     assert err == "lidarflow: interrupted\n" and not rests(tmp_path)
     for file in tmp_path.rglob("*.npz"):
         io.load_flow(file)
+
+
+def test_solver_is_short_for_its_setting(lidarflow, scans, tmp_path):
+    for name in ("gtsam", "fast"):
+        lidarflow.ok("pair", *scans[:2], "--out", tmp_path / f"{name}.npz", "--solver", name)
+        assert io.load_flow(tmp_path / f"{name}.npz").config["solver"]["method"] == name
+    told = lidarflow.complaint("pair", *scans[:2], "--out", tmp_path / "no.npz", "--solver", "slow")
+    assert "solver.method: expected one of fast, gtsam, got 'slow'" in told
+    assert "solver.method" in lidarflow.ok("config")

@@ -9,12 +9,13 @@ from lidarflow.kernels import multigrid, pose_graph
 from lidarflow.kernels.hierarchy import weigh
 
 # Where an iteration gains less than relative_tolerance of the energy, or absolute_tolerance, it is the last.
+# The others are those of multigrid.solve.
 Limits = namedtuple("Limits", (
     "max_iterations", "relative_tolerance", "absolute_tolerance", "step_tolerance", "max_products",
     "correction"))
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-5, 1e5, 10.0    # as in gtsam
 _SURELY_LESS = 0.03    # a cycle foresees at least this share of what there is to gain
-FIGURES = 5     # iterations, first energy, last energy, whether the limit was reached, products
+FIGURES = 5            # iterations, first energy, last energy, whether the limit was reached, products
 
 # variables (M, 7) and those on trial; places (M, 3); gradients (2, M, 6) of the smoothness and of all of the
 # energy, and active (2, M) matches and ties: one for the variables, one for those on trial, in turns.
@@ -83,11 +84,10 @@ def _step(factors, hierarchy, room, c, nodes, edges, limits, state, robust, smoo
     energy = _energy(factors, variables, nodes, robust, smooth, state, here)
     _linearise(factors, hierarchy, c, nodes, state, here)
     figures[1] = energy
-    damping, stale = _FIRST_DAMPING, True
+    damping = _FIRST_DAMPING
     while figures[0] < limits.max_iterations and damping <= _MOST_DAMPING:
-        if stale:
-            multigrid.hold(hierarchy, room, c, state.places, active[here], factors.data_weight,
-                           factors.tie_weight, damping)
+        multigrid.hold(
+            hierarchy, room, c, state.places, active[here], factors.data_weight, factors.tie_weight, damping)
         least = max(limits.relative_tolerance * energy, limits.absolute_tolerance)
         products = multigrid.solve(
             hierarchy, room, c, state.gradients[here], limits.step_tolerance, _SURELY_LESS * least,
@@ -103,17 +103,15 @@ def _step(factors, hierarchy, room, c, nodes, edges, limits, state, robust, smoo
         found = _energy(factors, trials, nodes, robust, trial_smooth, state, there)
         gained = energy - found
         if not gained >= 0.0:
-            stale, damping = True, damping * _DAMPING_FACTOR
+            damping *= _DAMPING_FACTOR
             continue
         figures[0] += 1
-        stale = damping > _FIRST_DAMPING or (active[here, first:last] != active[there, first:last]).any()
         damping = max(damping / _DAMPING_FACTOR, _FIRST_DAMPING)
         variables[first:last] = trials[first:last]
         energy, smooth, here = found, trial_smooth, there
         if gained < least:
             break
         _linearise(factors, hierarchy, c, nodes, state, here)
-        stale = True
     figures[2] = energy
     figures[3] = figures[0] >= limits.max_iterations
     return smooth, here

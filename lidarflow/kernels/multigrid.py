@@ -269,7 +269,8 @@ def solve(hierarchy, room, c, gradient, tolerance, enough, most, correction):
     """Fill `step` (M, 6) of component c with the twists that minimise the quadratic model of the energy.
 
     Conjugate gradients, until an iteration gains less than `tolerance` of what all have gained, or `most`
-    iterations. Where less than `enough` seems to be there to gain, none is made. Returns how many were.
+    iterations. Where less than `enough` seems to be there to gain, none is made. Returns how many were made,
+    each with one product and one cycle, whose coarse twists are lengthened by `correction`.
     """
     first, last = hierarchy.bounds[0, c], hierarchy.bounds[0, c + 1]
     loads, step, direction, product = room.loads, room.step, room.direction, room.product

@@ -1,9 +1,10 @@
-"""The pointwise factor graph solved by Levenberg-Marquardt with multigrid, all components at once.
+"""The pointwise factor graph solved by Levenberg-Marquardt, its normal equations by multigrid.
 
-Energy, steps and stopping rule are those of gtsam_lm.py. A step of a variable is a twist ξ_i at the sensor's
-origin, τ_i ← τ_i Exp(ξ_i). Neighbours move nearly alike, so that the normal equations take the relative
-motion of neighbours as none: then they do not change from one iteration to the next, but for the matches
-that are let go. The energy and its gradient are exact, so the minimum is.
+Energy, steps and stopping rule are those of gtsam_lm.py. A variable is moved by a twist in the target's
+frame, so that the error between neighbours, Log(τ_i⁻¹ τ_j), changes by K (ξ_j − ξ_i), and a motion that all
+neighbours share costs nothing. K is the inverse left Jacobian of the error, which is near the identity,
+times the adjoint of τ_i⁻¹. The normal equations leave the first out; energy and gradient are exact, so the
+minimum is. What K leaves of the normal equations adds up like inertia (kernels/inertia.py).
 """
 
 import numba
@@ -14,9 +15,9 @@ from lidarflow.kernels import hierarchy, levenberg_marquardt, multigrid, pose_gr
 from lidarflow.solve import common
 from lidarflow.types import FlowProblem, SolveStats
 
-STEP_TOLERANCE = 0.03
-MAX_PRODUCTS = 50
-CORRECTION = 1.8
+_STEP_TOLERANCE = 0.03    # conjugate gradients stop at an iteration that adds less than this to their gain
+_MAX_PRODUCTS = 50
+_CORRECTION = 1.8         # aggregates are too stiff: coarse steps are lengthened (Braess 1995)
 
 
 def solve(
@@ -57,18 +58,30 @@ def _optimise(
     factors = factors_of(problem, rows, place, points, edges, config)
     levels = hierarchy.build(edges, bounds, config.smoothness_weight)
     variables = pose_graph.variables_of(problem.initial[rows], points)
+    # Twists are about the origin of the target's frame: each component gets one of its own, near to it.
+    origin = np.repeat(variables[bounds[:-1], 4:], counts, axis=0)
+    for positions in (variables[:, 4:], factors.targets, factors.ties[:, 4:]):
+        positions -= origin
     shares, share_bounds = _shares(counts)
     limits = levenberg_marquardt.Limits(
-        config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE, STEP_TOLERANCE,
-        MAX_PRODUCTS, CORRECTION)
+        config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE, _STEP_TOLERANCE,
+        _MAX_PRODUCTS, _CORRECTION)
     figures = levenberg_marquardt.optimise_each(
         factors, levels, multigrid.room_for(levels), edge_bounds, shares, share_bounds, limits,
         levenberg_marquardt.state_at(variables))
+    variables[:, 4:] += origin
     pose_graph.motions_of(variables, points, rows, motions)
     return figures
 
 
-def factors_of(problem, rows, place, points, edges, config: SolverConfig) -> pose_graph.Factors:
+def factors_of(
+    problem: FlowProblem, rows: np.ndarray, place: np.ndarray, points: np.ndarray, edges: np.ndarray,
+    config: SolverConfig,
+) -> pose_graph.Factors:
+    """Factors of the variables `rows` (M',) of a problem, at `points` (M', 3), in that order.
+
+    place (M,) is where each variable of the problem is in it, or -1; edges (E', 2) are between places.
+    """
     matched, targets = np.zeros(len(rows), bool), np.zeros((len(rows), 3))
     index = place[problem.match_index]
     matched[index[index >= 0]] = True
