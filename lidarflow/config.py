@@ -95,7 +95,7 @@ class GraphConfig:
 @dataclass(frozen=True, slots=True)
 class SolverConfig:
     method: str = setting(
-        "gtsam", "what solves the graph: multigrid in compiled kernels, or gtsam, the reference",
+        "fast", "what solves the graph: multigrid in compiled kernels, or gtsam, the reference",
         choices=("fast", "gtsam"))
     truncation_m: float = setting(
         0.05**0.5, "c: residuals beyond it count as outliers (c² = 0.05 m²)", low=1e-3)
