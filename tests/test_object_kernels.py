@@ -74,7 +74,7 @@ def check_moved_tree(count: int) -> None:
     there = pose.apply(motion, points)
     found = tree.moved(tree.build(points), there)
     np.testing.assert_array_equal(found.points, there[found.rows])
-    for start, end, low, high in zip(found.starts, found.ends, found.low, found.high, strict=True):
+    for start, end, (low, high) in zip(found.starts, found.ends, found.boxes, strict=True):
         np.testing.assert_array_equal(low, found.points[start:end].min(axis=0))
         np.testing.assert_array_equal(high, found.points[start:end].max(axis=0))
     distance_m, row = tree.query(found, there, 0.1)

@@ -18,25 +18,23 @@ CHUNK = 512      # queries that one thread takes at a time; it takes longer to s
 class Tree(NamedTuple):
     """A k-d tree.
 
-    points  (N, 3) float64   in the order of the leaves
-    rows    (N,) int64       where each of them was before
-    starts  (M,) int64       first point of each node, level by level
-    ends    (M,) int64       and the one after its last
-    low     (M, 3) float64   corners of the box around a node's points
-    high    (M, 3) float64
+    points  (N, 3) float64      in the order of the leaves
+    rows    (N,) int64          where each of them was before
+    starts  (M,) int64          first point of each node, level by level
+    ends    (M,) int64          and the one after its last
+    boxes   (M, 2, 3) float64   lower and upper corner of the box around a node's points
     """
 
     points: np.ndarray
     rows: np.ndarray
     starts: np.ndarray
     ends: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    boxes: np.ndarray
 
 
 NOTHING = Tree(
     np.empty((0, 3)), np.empty(0, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64),
-    np.full((1, 3), np.inf), np.full((1, 3), -np.inf))
+    np.full((1, 2, 3), [[np.inf], [-np.inf]]))
 
 
 def build(points: np.ndarray) -> Tree:
@@ -46,8 +44,8 @@ def build(points: np.ndarray) -> Tree:
 
 def moved(tree: Tree, points: np.ndarray) -> Tree:
     """The tree of the same rows once they have moved together to `points` (N, 3); boxes are made anew."""
-    placed, low, high = _moved(tree, np.ascontiguousarray(points))
-    return tree._replace(points=placed, low=low, high=high)
+    placed, boxes = _moved(tree, np.ascontiguousarray(points))
+    return tree._replace(points=placed, boxes=boxes)
 
 
 def query(tree: Tree, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -93,45 +91,47 @@ def grown(points):
         nodes = 2 * nodes + 1
     placed, rows = points.copy(), np.arange(count)
     starts, ends = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64)
-    low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
+    boxes = np.empty((nodes, 2, 3))
+    boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
     ends[0] = count
     leaves = nodes // 2
     for node in range(nodes):
         start, end = starts[node], ends[node]
         for i in range(start, end):
             for k in range(3):
-                low[node, k] = min(low[node, k], placed[i, k])
-                high[node, k] = max(high[node, k], placed[i, k])
+                boxes[node, 0, k] = min(boxes[node, 0, k], placed[i, k])
+                boxes[node, 1, k] = max(boxes[node, 1, k], placed[i, k])
         if node >= leaves:
             continue
         middle = (start + end) // 2
         axis = 0
         for k in range(1, 3):
-            if high[node, k] - low[node, k] > high[node, axis] - low[node, axis]:
+            if boxes[node, 1, k] - boxes[node, 0, k] > boxes[node, 1, axis] - boxes[node, 0, axis]:
                 axis = k
         _part(placed, rows, axis, start, end, middle)
         starts[2 * node + 1], ends[2 * node + 1] = start, middle
         starts[2 * node + 2], ends[2 * node + 2] = middle, end
-    return Tree(placed, rows, starts, ends, low, high)
+    return Tree(placed, rows, starts, ends, boxes)
 
 
 @numba.njit(cache=True)
 def _moved(tree, points):
     nodes = len(tree.ends)
     placed = np.empty_like(points)
-    low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
+    boxes = np.empty((nodes, 2, 3))
+    boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
     for node in range(nodes - 1, -1, -1):
         if node >= nodes // 2:
             for i in range(tree.starts[node], tree.ends[node]):
                 for k in range(3):
                     placed[i, k] = points[tree.rows[i], k]
-                    low[node, k] = min(low[node, k], placed[i, k])
-                    high[node, k] = max(high[node, k], placed[i, k])
+                    boxes[node, 0, k] = min(boxes[node, 0, k], placed[i, k])
+                    boxes[node, 1, k] = max(boxes[node, 1, k], placed[i, k])
         else:
             for k in range(3):
-                low[node, k] = min(low[2 * node + 1, k], low[2 * node + 2, k])
-                high[node, k] = max(high[2 * node + 1, k], high[2 * node + 2, k])
-    return placed, low, high
+                boxes[node, 0, k] = min(boxes[2 * node + 1, 0, k], boxes[2 * node + 2, 0, k])
+                boxes[node, 1, k] = max(boxes[2 * node + 1, 1, k], boxes[2 * node + 2, 1, k])
+    return placed, boxes
 
 
 @numba.njit(cache=True)
@@ -168,9 +168,9 @@ def _median(a, b, c):
 @numba.njit(cache=True, inline="always")
 def box_distance_sq(tree, node, x, y, z):
     """Squared distance of x, y, z from a node's box, 0 inside it."""
-    dx = max(max(tree.low[node, 0] - x, x - tree.high[node, 0]), 0.0)
-    dy = max(max(tree.low[node, 1] - y, y - tree.high[node, 1]), 0.0)
-    dz = max(max(tree.low[node, 2] - z, z - tree.high[node, 2]), 0.0)
+    dx = max(max(tree.boxes[node, 0, 0] - x, x - tree.boxes[node, 1, 0]), 0.0)
+    dy = max(max(tree.boxes[node, 0, 1] - y, y - tree.boxes[node, 1, 1]), 0.0)
+    dz = max(max(tree.boxes[node, 0, 2] - z, z - tree.boxes[node, 1, 2]), 0.0)
     return dx * dx + dy * dy + dz * dz
 
 
@@ -354,7 +354,9 @@ def _boxes_are_near(tree, node, body, radius_sq):
     """Whether a node's box is nearer than the root of `radius_sq` to the box around the whole body."""
     apart_sq = 0.0
     for k in range(3):
-        gap = max(max(tree.low[node, k] - body.high[0, k], body.low[0, k] - tree.high[node, k]), 0.0)
+        below = body.boxes[0, 0, k] - tree.boxes[node, 1, k]
+        above = tree.boxes[node, 0, k] - body.boxes[0, 1, k]
+        gap = max(max(below, above), 0.0)
         apart_sq += gap * gap
     return apart_sq < radius_sq
 
@@ -364,7 +366,7 @@ def _farthest_sq(tree, node, points, i):
     """Squared distance from point i to the farthest corner of a node's box."""
     apart_sq = 0.0
     for k in range(3):
-        gap = max(points[i, k] - tree.low[node, k], tree.high[node, k] - points[i, k])
+        gap = max(points[i, k] - tree.boxes[node, 0, k], tree.boxes[node, 1, k] - points[i, k])
         apart_sq += gap * gap
     return apart_sq
 
