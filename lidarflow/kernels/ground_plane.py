@@ -20,8 +20,8 @@ def slope(ground, centre, radius_m):
     count = trees.all_within(ground, centre[0], centre[1], centre[2], radius_m * radius_m, found)
     mean = np.zeros(3)
     for i in range(count):
-        mean += ground.points[found[i]]
-    mean /= max(count, 1)
+        for k in range(3):
+            mean[k] += ground.points[found[i], k] / count
     xx = xy = yy = xz = yz = 0.0
     for i in range(count):
         at = ground.points[found[i]]
