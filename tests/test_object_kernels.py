@@ -19,6 +19,7 @@ from lidarflow.kernels import (
     linalg,
     links,
     misfit,
+    neighbours,
     registration,
     tree,
     votes,
@@ -61,7 +62,7 @@ def check_tree(count: int) -> None:
     np.testing.assert_array_equal(np.sort(built.rows), np.arange(count))
     apart_m = cdist(queries, points)
 
-    found_m, row = tree.query(built, queries, 0.7)
+    found_m, row = neighbours.query(built, queries, 0.7)
     near = apart_m.min(axis=1) < 0.7
     assert near.any() and not near.all()
     np.testing.assert_allclose(found_m[near], apart_m.min(axis=1)[near], atol=1e-12)
@@ -70,14 +71,14 @@ def check_tree(count: int) -> None:
 
     reach_m = rng(3).uniform(0.01, 1.0, len(queries))
     np.testing.assert_array_equal(
-        tree.any_within(built, queries, reach_m), apart_m.min(axis=1) <= reach_m)
+        neighbours.any_within(built, queries, reach_m), apart_m.min(axis=1) <= reach_m)
     marks = rng(4).random((count, 2)) < 0.4
     expected = [[(inside & mark).sum() for mark in marks.T] for inside in apart_m <= 0.5]
-    np.testing.assert_array_equal(tree.counts_around(built, marks, queries, 0.5), expected)
+    np.testing.assert_array_equal(neighbours.counts_around(built, marks, queries, 0.5), expected)
     for radius_m in (0.05, 0.4, 3.0):
         body = queries[:: max(1, count // 20)]
         expected = np.flatnonzero(cdist(points, body).min(axis=1) < radius_m)
-        np.testing.assert_array_equal(tree.near_rows(built, tree.build(body), radius_m), expected)
+        np.testing.assert_array_equal(neighbours.near_rows(built, tree.build(body), radius_m), expected)
 
 
 def check_moved_tree(count: int) -> None:
@@ -85,10 +86,10 @@ def check_moved_tree(count: int) -> None:
     there = pose.apply(motion, points)
     found = tree.moved(tree.build(points), there)
     np.testing.assert_array_equal(found.points, there[found.rows])
-    for start, end, low, high in zip(found.starts, found.ends, found.low, found.high, strict=True):
+    for start, end, (low, high) in zip(found.starts, found.ends, found.boxes, strict=True):
         np.testing.assert_array_equal(low, found.points[start:end].min(axis=0))
         np.testing.assert_array_equal(high, found.points[start:end].max(axis=0))
-    distance_m, row = tree.query(found, there, 0.1)
+    distance_m, row = neighbours.query(found, there, 0.1)
     assert (distance_m == 0.0).all() and (there[row] == there).all()
 
 
@@ -96,11 +97,11 @@ def check_empty_tree() -> None:
     nothing, points = tree.build(np.empty((0, 3))), np.ones((2, 3))
     for mine, given in zip(nothing, tree.NOTHING, strict=True):
         np.testing.assert_array_equal(mine, given)
-    assert np.isinf(tree.query(nothing, points, 9.0)[0]).all()
-    assert not tree.any_within(nothing, points, np.full(2, 9.0)).any()
-    assert len(tree.near_rows(nothing, tree.build(points), 9.0)) == 0
-    assert len(tree.near_rows(tree.build(points), nothing, 9.0)) == 0
-    assert (tree.counts_around(nothing, np.zeros((0, 1), bool), points, 9.0) == 0).all()
+    assert np.isinf(neighbours.query(nothing, points, 9.0)[0]).all()
+    assert not neighbours.any_within(nothing, points, np.full(2, 9.0)).any()
+    assert len(neighbours.near_rows(nothing, tree.build(points), 9.0)) == 0
+    assert len(neighbours.near_rows(tree.build(points), nothing, 9.0)) == 0
+    assert (neighbours.counts_around(nothing, np.zeros((0, 1), bool), points, 9.0) == 0).all()
 
 
 # ---- voxels, links, votes -------------------------------------------------------------------------------
@@ -380,9 +381,9 @@ def test_a_moved_tree():
 
 def test_a_tree_of_many_equal_points():
     built = tree.build(np.zeros((500, 3)))
-    found_m, _ = tree.query(built, np.array([[0.0, 0.0, 0.3]]), 1.0)
+    found_m, _ = neighbours.query(built, np.array([[0.0, 0.0, 0.3]]), 1.0)
     assert found_m[0] == 0.3
-    assert len(tree.near_rows(built, tree.build(np.zeros((1, 3))), 0.1)) == 500
+    assert len(neighbours.near_rows(built, tree.build(np.zeros((1, 3))), 0.1)) == 500
 
 
 def test_voxel_numbers():

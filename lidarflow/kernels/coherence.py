@@ -76,7 +76,7 @@ def _some_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m, s
         quadratic = (xx * t[0] * t[0] + yy * t[1] * t[1] + zz * t[2] * t[2]
                      + 2.0 * (xy * t[0] * t[1] + xz * t[0] * t[2] + yz * t[1] * t[2]))
         left_sq = total_sq - 2.0 * (rx * t[0] + ry * t[1] + rz * t[2]) + quadratic
-        shifts[i] = t
+        shifts[i, 0], shifts[i, 1], shifts[i, 2] = t[0], t[1], t[2]
         before_m[i] = math.sqrt(total_sq / count)
         after_m[i] = math.sqrt(max(left_sq, 0.0) / count)
 

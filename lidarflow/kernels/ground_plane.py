@@ -20,8 +20,8 @@ def slope(ground, centre, radius_m):
     count = trees.all_within(ground, centre[0], centre[1], centre[2], radius_m * radius_m, found)
     mean = np.zeros(3)
     for i in range(count):
-        mean += ground.points[found[i]]
-    mean /= max(count, 1)
+        for k in range(3):
+            mean[k] += ground.points[found[i], k] / count
     xx = xy = yy = xz = yz = 0.0
     for i in range(count):
         at = ground.points[found[i]]
@@ -50,8 +50,8 @@ def heights(ground, x, y, radius_m):
     while depth > 0:
         depth -= 1
         node = waiting[depth]
-        dx = max(max(ground.low[node, 0] - x, x - ground.high[node, 0]), 0.0)
-        dy = max(max(ground.low[node, 1] - y, y - ground.high[node, 1]), 0.0)
+        dx = max(max(ground.boxes[node, 0, 0] - x, x - ground.boxes[node, 1, 0]), 0.0)
+        dy = max(max(ground.boxes[node, 0, 1] - y, y - ground.boxes[node, 1, 1]), 0.0)
         if dx * dx + dy * dy > radius_sq:
             continue
         if node < leaves:

@@ -61,19 +61,20 @@ def _onto_points(points, target, translation, gates_m, rounds_per_gate, motion):
                 along += ax * bx + ay * by
             if paired < MIN_POINTS:
                 break
-            a, b = a / paired, b / paired
-            last_turn, last_shift = turn, shift
-            turn = 0.0
+            for k in range(3):
+                a[k] /= paired
+                b[k] /= paired
+            last_turn, turn = turn, 0.0
             if paired >= MIN_TURNING_POINTS:
                 crossed -= paired * (a[0] * b[1] - a[1] * b[0])
                 along -= paired * (a[0] * b[0] + a[1] * b[1])
                 turn = min(max(math.atan2(crossed, along), -MAX_TURN_RAD), MAX_TURN_RAD)
             cosine, sine = math.cos(turn), math.sin(turn)
-            shift = np.empty(3)
-            shift[0] = b[0] - (cosine * a[0] - sine * a[1])
-            shift[1] = b[1] - (sine * a[0] + cosine * a[1])
-            shift[2] = b[2] - a[2]
-            if abs(turn - last_turn) < _SETTLED and np.abs(shift - last_shift).max() < _SETTLED:
+            changed = abs(turn - last_turn)
+            for k, turned in enumerate((cosine * a[0] - sine * a[1], sine * a[0] + cosine * a[1], a[2])):
+                changed = max(changed, abs(b[k] - turned - shift[k]))
+                shift[k] = b[k] - turned
+            if changed < _SETTLED:
                 break
     _about(centre, turn, shift, motion)
 
@@ -92,10 +93,8 @@ def onto_planes(
     shift = shift.copy()
     place, asked = np.full(len(points), -1), np.zeros((len(points), 3))
     clear_m = np.full(len(points), -np.inf)
-    matrix, right = np.empty((4, 4)), np.empty(4)
     for gate_m in gates_m:
-        matrix[:] = 0.0
-        right[:] = 0.0
+        matrix, right = np.zeros((4, 4)), np.zeros(4)
         total, count = _add_pairs(
             points, normals, target, target_normals, centre, turn, shift, gate_m, plane_scale_m,
             point_scale_m, point_weight, min_agreement, place, asked, clear_m, matrix, right)
@@ -114,8 +113,11 @@ def onto_planes(
             matrix[a, a] += _REGULARISATION * max(total, 1.0)
         solve_positive4(matrix, right)
         turn = min(max(turn + right[0], -MAX_TURN_RAD), MAX_TURN_RAD)
-        shift += right[1:]
-        if gate_m == gates_m[-1] and np.abs(right).max() < _SETTLED:
+        changed = abs(right[0])
+        for k in range(3):
+            shift[k] += right[1 + k]
+            changed = max(changed, abs(right[1 + k]))
+        if gate_m == gates_m[-1] and changed < _SETTLED:
             break
     motion = np.empty((4, 4))
     _about(centre, turn, shift, motion)
@@ -195,15 +197,20 @@ def follow(target, x, y, z, gate_m, i, place, asked, clear_m):
 def _mean(points):
     mean = np.zeros(3)
     for i in range(len(points)):
-        mean += points[i]
-    return mean / len(points)
+        for k in range(3):
+            mean[k] += points[i, k]
+    for k in range(3):
+        mean[k] /= len(points)
+    return mean
 
 
 @numba.njit(cache=True)
 def _about(centre, turn, shift, motion):
     """Fill `motion` (4, 4) with the turn about the vertical through `centre` and the shift that follows."""
     cosine, sine = math.cos(turn), math.sin(turn)
-    motion[:] = np.eye(4)
+    for i in range(4):
+        for j in range(4):
+            motion[i, j] = 1.0 if i == j else 0.0
     motion[0, 0], motion[0, 1], motion[1, 0], motion[1, 1] = cosine, -sine, sine, cosine
     motion[0, 3] = centre[0] + shift[0] - (cosine * centre[0] - sine * centre[1])
     motion[1, 3] = centre[1] + shift[1] - (sine * centre[0] + cosine * centre[1])

@@ -48,7 +48,8 @@ def _cells(points, cell_m):
     means, place = np.empty((count, 3)), np.empty(count, np.int64)
     order = np.argsort(keys)
     for rank in range(count):
-        means[rank] = sums[order[rank]] / counts[order[rank]]
+        for k in range(3):
+            means[rank, k] = sums[order[rank], k] / counts[order[rank]]
         place[order[rank]] = rank
     return member, means, place
 

@@ -1,10 +1,9 @@
-"""k-d tree over points: nearest neighbours and neighbourhoods, for queries inside other kernels.
+"""k-d tree over points, for queries inside other kernels.
 
 Nodes are halves of halves down to small leaves, each with the box around its points; the children of node i
 are 2 i + 1 and 2 i + 2. Points lie in the order of the leaves, so that a node is one run of them.
 """
 
-import math
 from typing import NamedTuple
 
 import numba
@@ -18,25 +17,23 @@ CHUNK = 512      # queries that one thread takes at a time; it takes longer to s
 class Tree(NamedTuple):
     """A k-d tree.
 
-    points  (N, 3) float64   in the order of the leaves
-    rows    (N,) int64       where each of them was before
-    starts  (M,) int64       first point of each node, level by level
-    ends    (M,) int64       and the one after its last
-    low     (M, 3) float64   corners of the box around a node's points
-    high    (M, 3) float64
+    points  (N, 3) float64      in the order of the leaves
+    rows    (N,) int64          where each of them was before
+    starts  (M,) int64          first point of each node, level by level
+    ends    (M,) int64          and the one after its last
+    boxes   (M, 2, 3) float64   lower and upper corner of the box around a node's points
     """
 
     points: np.ndarray
     rows: np.ndarray
     starts: np.ndarray
     ends: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    boxes: np.ndarray
 
 
 NOTHING = Tree(
     np.empty((0, 3)), np.empty(0, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64),
-    np.full((1, 3), np.inf), np.full((1, 3), -np.inf))
+    np.full((1, 2, 3), [[np.inf], [-np.inf]]))
 
 
 def build(points: np.ndarray) -> Tree:
@@ -46,43 +43,8 @@ def build(points: np.ndarray) -> Tree:
 
 def moved(tree: Tree, points: np.ndarray) -> Tree:
     """The tree of the same rows once they have moved together to `points` (N, 3); boxes are made anew."""
-    placed, low, high = _moved(tree, np.ascontiguousarray(points))
-    return tree._replace(points=placed, low=low, high=high)
-
-
-def query(tree: Tree, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) from each of points (N, 3) to the nearest of the tree, and its row (N,).
-
-    Infinite and -1 where nothing is nearer than `reach_m`.
-    """
-    distance_m, row = np.full(len(points), np.inf), np.full(len(points), -1)
-    kernel = _query_in_chunks if len(points) > CHUNK else _query
-    kernel(tree, np.ascontiguousarray(points), float(reach_m), distance_m, row)
-    return distance_m, row
-
-
-def near_rows(tree: Tree, body: Tree, radius_m: float) -> np.ndarray:
-    """Ascending rows of the tree's points that are nearer than `radius_m` to any point of a body."""
-    return np.sort(_near_rows(tree, body, float(radius_m)))
-
-
-def counts_around(
-    tree: Tree, marks: np.ndarray, points: np.ndarray, radius_m: float
-) -> np.ndarray:
-    """How many (K, F) of the tree's points with each of F marks lie within `radius_m` of points (K, 3).
-
-    marks (N, F) bool are aligned with the rows the tree was built from.
-    """
-    counts = np.zeros((len(points), marks.shape[1]), np.int64)
-    before = _before(tree, marks)
-    kernel = _counts_in_chunks if len(points) > CHUNK else _counts_around
-    kernel(tree, before, np.ascontiguousarray(points), float(radius_m), counts)
-    return counts
-
-
-def any_within(tree: Tree, points: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
-    """Whether (N,) the tree has a point as near to each of points (N, 3) as its `reach_m` (N,)."""
-    return _any_within(tree, np.ascontiguousarray(points), reach_m)
+    placed, boxes = _moved(tree, np.ascontiguousarray(points))
+    return tree._replace(points=placed, boxes=boxes)
 
 
 @numba.njit(cache=True)
@@ -93,45 +55,54 @@ def grown(points):
         nodes = 2 * nodes + 1
     placed, rows = points.copy(), np.arange(count)
     starts, ends = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64)
-    low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
+    boxes = _no_boxes(nodes)
     ends[0] = count
     leaves = nodes // 2
     for node in range(nodes):
         start, end = starts[node], ends[node]
         for i in range(start, end):
             for k in range(3):
-                low[node, k] = min(low[node, k], placed[i, k])
-                high[node, k] = max(high[node, k], placed[i, k])
+                boxes[node, 0, k] = min(boxes[node, 0, k], placed[i, k])
+                boxes[node, 1, k] = max(boxes[node, 1, k], placed[i, k])
         if node >= leaves:
             continue
         middle = (start + end) // 2
         axis = 0
         for k in range(1, 3):
-            if high[node, k] - low[node, k] > high[node, axis] - low[node, axis]:
+            if boxes[node, 1, k] - boxes[node, 0, k] > boxes[node, 1, axis] - boxes[node, 0, axis]:
                 axis = k
         _part(placed, rows, axis, start, end, middle)
         starts[2 * node + 1], ends[2 * node + 1] = start, middle
         starts[2 * node + 2], ends[2 * node + 2] = middle, end
-    return Tree(placed, rows, starts, ends, low, high)
+    return Tree(placed, rows, starts, ends, boxes)
+
+
+@numba.njit(cache=True)
+def _no_boxes(count):
+    boxes = np.empty((count, 2, 3))
+    for node in range(count):
+        for k in range(3):
+            boxes[node, 0, k], boxes[node, 1, k] = np.inf, -np.inf
+    return boxes
 
 
 @numba.njit(cache=True)
 def _moved(tree, points):
     nodes = len(tree.ends)
     placed = np.empty_like(points)
-    low, high = np.full((nodes, 3), np.inf), np.full((nodes, 3), -np.inf)
+    boxes = _no_boxes(nodes)
     for node in range(nodes - 1, -1, -1):
         if node >= nodes // 2:
             for i in range(tree.starts[node], tree.ends[node]):
                 for k in range(3):
                     placed[i, k] = points[tree.rows[i], k]
-                    low[node, k] = min(low[node, k], placed[i, k])
-                    high[node, k] = max(high[node, k], placed[i, k])
+                    boxes[node, 0, k] = min(boxes[node, 0, k], placed[i, k])
+                    boxes[node, 1, k] = max(boxes[node, 1, k], placed[i, k])
         else:
             for k in range(3):
-                low[node, k] = min(low[2 * node + 1, k], low[2 * node + 2, k])
-                high[node, k] = max(high[2 * node + 1, k], high[2 * node + 2, k])
-    return placed, low, high
+                boxes[node, 0, k] = min(boxes[2 * node + 1, 0, k], boxes[2 * node + 2, 0, k])
+                boxes[node, 1, k] = max(boxes[2 * node + 1, 1, k], boxes[2 * node + 2, 1, k])
+    return placed, boxes
 
 
 @numba.njit(cache=True)
@@ -168,9 +139,9 @@ def _median(a, b, c):
 @numba.njit(cache=True, inline="always")
 def box_distance_sq(tree, node, x, y, z):
     """Squared distance of x, y, z from a node's box, 0 inside it."""
-    dx = max(max(tree.low[node, 0] - x, x - tree.high[node, 0]), 0.0)
-    dy = max(max(tree.low[node, 1] - y, y - tree.high[node, 1]), 0.0)
-    dz = max(max(tree.low[node, 2] - z, z - tree.high[node, 2]), 0.0)
+    dx = max(max(tree.boxes[node, 0, 0] - x, x - tree.boxes[node, 1, 0]), 0.0)
+    dy = max(max(tree.boxes[node, 0, 1] - y, y - tree.boxes[node, 1, 1]), 0.0)
+    dz = max(max(tree.boxes[node, 0, 2] - z, z - tree.boxes[node, 1, 2]), 0.0)
     return dx * dx + dy * dy + dz * dz
 
 
@@ -292,122 +263,3 @@ def all_within(tree, x, y, z, radius_sq, found):
                 found[count] = i
                 count += 1
     return count
-
-
-@numba.njit(cache=True, parallel=True)
-def _query_in_chunks(tree, points, reach_m, distance_m, row):
-    for chunk in numba.prange((len(points) + CHUNK - 1) // CHUNK):
-        start, end = chunk * CHUNK, (chunk + 1) * CHUNK
-        _query(tree, points[start:end], reach_m, distance_m[start:end], row[start:end])
-
-
-@numba.njit(cache=True)
-def _query(tree, points, reach_m, distance_m, row):
-    for i in range(len(points)):
-        place, apart_sq = nearest(tree, points[i, 0], points[i, 1], points[i, 2], reach_m * reach_m, -1)
-        if place >= 0:
-            distance_m[i], row[i] = math.sqrt(apart_sq), tree.rows[place]
-
-
-@numba.njit(cache=True, parallel=True)
-def _any_within(tree, points, reach_m):
-    found = np.zeros(len(points), np.bool_)
-    for i in numba.prange(len(points)):
-        found[i] = within(tree, points[i, 0], points[i, 1], points[i, 2], reach_m[i] * reach_m[i]) >= 0
-    return found
-
-
-@numba.njit(cache=True)
-def _near_rows(tree, body, radius_m):
-    found, count = np.empty(len(tree.rows), np.int64), 0
-    leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
-    waiting = np.empty(DEPTH, np.int64)
-    waiting[0], depth = 0, 1
-    witness = 0   # what was near to the last point is probably near to this one
-    while depth > 0:
-        depth -= 1
-        node = waiting[depth]
-        if not _boxes_are_near(tree, node, body, radius_sq):
-            continue
-        if _farthest_sq(tree, node, body.points, witness) < radius_sq:
-            for i in range(tree.starts[node], tree.ends[node]):
-                found[count] = tree.rows[i]
-                count += 1
-        elif node < leaves:
-            waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2
-            depth += 2
-        else:
-            for i in range(tree.starts[node], tree.ends[node]):
-                x, y, z = tree.points[i, 0], tree.points[i, 1], tree.points[i, 2]
-                if distance_sq(body.points, witness, x, y, z) >= radius_sq:
-                    place, _ = nearest(body, x, y, z, radius_sq, -1)
-                    if place < 0:
-                        continue
-                    witness = place
-                found[count] = tree.rows[i]
-                count += 1
-    return found[:count].copy()
-
-
-@numba.njit(cache=True, inline="always")
-def _boxes_are_near(tree, node, body, radius_sq):
-    """Whether a node's box is nearer than the root of `radius_sq` to the box around the whole body."""
-    apart_sq = 0.0
-    for k in range(3):
-        gap = max(max(tree.low[node, k] - body.high[0, k], body.low[0, k] - tree.high[node, k]), 0.0)
-        apart_sq += gap * gap
-    return apart_sq < radius_sq
-
-
-@numba.njit(cache=True, inline="always")
-def _farthest_sq(tree, node, points, i):
-    """Squared distance from point i to the farthest corner of a node's box."""
-    apart_sq = 0.0
-    for k in range(3):
-        gap = max(points[i, k] - tree.low[node, k], tree.high[node, k] - points[i, k])
-        apart_sq += gap * gap
-    return apart_sq
-
-
-@numba.njit(cache=True)
-def _before(tree, marks):
-    """How many (N + 1, F) points in front of each place have each mark."""
-    before = np.zeros((len(marks) + 1, marks.shape[1]), np.int64)
-    for i in range(len(marks)):
-        for mark in range(marks.shape[1]):
-            before[i + 1, mark] = before[i, mark] + marks[tree.rows[i], mark]
-    return before
-
-
-@numba.njit(cache=True, parallel=True)
-def _counts_in_chunks(tree, before, points, radius_m, counts):
-    for chunk in numba.prange((len(points) + CHUNK - 1) // CHUNK):
-        start, end = chunk * CHUNK, (chunk + 1) * CHUNK
-        _counts_around(tree, before, points[start:end], radius_m, counts[start:end])
-
-
-@numba.njit(cache=True)
-def _counts_around(tree, before, points, radius_m, counts):
-    """Add the counts of marks (K, F) to `counts`; a node in reach as a whole is two look-ups in `before`."""
-    leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
-    waiting = np.empty(DEPTH, np.int64)
-    for k in range(len(points)):
-        x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        waiting[0], depth = 0, 1
-        while depth > 0:
-            depth -= 1
-            node = waiting[depth]
-            if box_distance_sq(tree, node, x, y, z) > radius_sq:
-                continue
-            start, end = tree.starts[node], tree.ends[node]
-            if _farthest_sq(tree, node, points, k) <= radius_sq:
-                for mark in range(counts.shape[1]):
-                    counts[k, mark] += before[end, mark] - before[start, mark]
-            elif node < leaves:
-                waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2
-                depth += 2
-            else:
-                for i in range(start, end):
-                    if distance_sq(tree.points, i, x, y, z) <= radius_sq:
-                        for mark in range(counts.shape[1]):
-                            counts[k, mark] += before[i + 1, mark] - before[i, mark]

@@ -17,8 +17,11 @@ def mode(shifts, radius_m):
     mean = np.zeros(3)
     for j in range(len(shifts)):
         if _apart_sq(shifts, best, j) <= radius_m * radius_m:
-            mean += shifts[j]
-    return mean / most
+            for k in range(3):
+                mean[k] += shifts[j, k]
+    for k in range(3):
+        mean[k] /= most
+    return mean
 
 
 @numba.njit(cache=True, inline="always")
@@ -54,6 +57,7 @@ def peaks(source, target, max_shift_m, max_rise_m, cell_m, count):
         u, v = best // votes.shape[1], best % votes.shape[1]
         if votes[u, v] == 0:
             return found[:peak].copy()
-        found[peak] = sums[u, v] / votes[u, v]
+        for k in range(3):
+            found[peak, k] = sums[u, v, k] / votes[u, v]
         votes[u, v] = 0
     return found

@@ -4,7 +4,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import ground_plane, tree
+from lidarflow.kernels import ground_plane, neighbours, tree
 from lidarflow.lidar.body import Body, near_rows
 from lidarflow.lidar.evidence import tolerance
 from lidarflow.lidar.surface import CAP_M, misfit_after
@@ -61,7 +61,7 @@ def _shape_ratio(view: View, body: Body, moved: np.ndarray) -> float:
     own_sq = (view.after(seen, body.over_ground).plane_m**2).sum()
     ego_sq = (view.by_ego.plane_m[seen] ** 2).sum()
 
-    around = tree.near_rows(view.upright.tree, tree.build(moved), _AROUND_M)
+    around = neighbours.near_rows(view.upright.tree, tree.build(moved), _AROUND_M)
     back = pose.inverse(body.over_ground)
     own_sq += (misfit_after(view.upright, around, back, view.source).plane_m ** 2).sum()
     ego_sq += (misfit_after(view.upright, around, np.eye(4), view.source).plane_m ** 2).sum()
@@ -108,7 +108,7 @@ def _left_and_arrived(view: View, body: Body, moved: np.ndarray) -> tuple[float,
     What a newcomer hides seems to have left, but has arrived nowhere new.
     """
     left = float(view.evidence.unexplained[body.rows].mean())
-    _, row = tree.query(view.upright.tree, moved, CAP_M)
+    _, row = neighbours.query(view.upright.tree, moved, CAP_M)
     row = row[row >= 0]
     return left, float(view.has_appeared[row].mean()) if len(row) else 0.0
 

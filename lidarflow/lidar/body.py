@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import grid, ground_plane, links, tree
+from lidarflow.kernels import grid, ground_plane, links, neighbours, tree
 from lidarflow.lidar import rigid_fit
 from lidarflow.lidar.view import View
 
@@ -106,13 +106,13 @@ def completed(view: View, body: Body, free: np.ndarray) -> Body:
 
 def near_rows(view: View, rows: np.ndarray, radius_m: float) -> np.ndarray:
     """Ascending rows of the view's points within `radius_m` of any of those at `rows` (K,)."""
-    return tree.near_rows(view.source.tree, tree.build(view.points[rows]), radius_m)
+    return neighbours.near_rows(view.source.tree, tree.build(view.points[rows]), radius_m)
 
 
 def _surrounded(view: View, on_body: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Whether (K,) most neighbours of each of `rows` are on the body."""
     marks = np.column_stack([on_body, ~on_body])
-    of_body, others = tree.counts_around(view.source.tree, marks, view.points[rows], _SURROUND_M).T
+    of_body, others = neighbours.counts_around(view.source.tree, marks, view.points[rows], _SURROUND_M).T
     return of_body - on_body[rows] > others - ~on_body[rows]   # the point itself has no say
 
 

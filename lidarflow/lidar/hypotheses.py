@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarflow.kernels import tree, votes
+from lidarflow.kernels import neighbours, tree, votes
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.surface import CAP_M
 from lidarflow.lidar.view import View
@@ -51,7 +51,7 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
 
 def _of_matches(view: View, body: Tree) -> list[np.ndarray]:
     """The most common shift of the matches on these points, and their median."""
-    shifts = view.match_shift[tree.near_rows(view.matched, body, _MATCH_RADIUS_M)]
+    shifts = view.match_shift[neighbours.near_rows(view.matched, body, _MATCH_RADIUS_M)]
     if len(shifts) < _MIN_MATCHES:
         return []
     return [votes.mode(shifts, _MATCH_MODE_M), np.median(shifts, axis=0)]
@@ -65,12 +65,12 @@ def _of_planes(shift: np.ndarray) -> list[np.ndarray]:
 
 def _of_expected(body: Tree, expected: tuple[Expected, ...]) -> list[np.ndarray]:
     """The shifts of the expected objects that these points may be on."""
-    return [e.shift for e in expected if len(tree.near_rows(e.points, body, _EXPECTED_RADIUS_M))]
+    return [e.shift for e in expected if len(neighbours.near_rows(e.points, body, _EXPECTED_RADIUS_M))]
 
 
 def _of_votes(view: View, points: np.ndarray, body: Tree, max_shift_m: float) -> list[np.ndarray]:
     """The translations that most often lead from these points to what appeared near them."""
-    near = tree.near_rows(view.appeared, body, max_shift_m)
+    near = neighbours.near_rows(view.appeared, body, max_shift_m)
     if len(near) < _MIN_APPEARED:
         return []
     appeared = view.newcomers[spread(near, 2 * _MAX_VOTERS)]

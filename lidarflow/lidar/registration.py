@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.errors import DataError
-from lidarflow.kernels import normals, tree
+from lidarflow.kernels import neighbours, normals, tree
 from lidarflow.kernels import registration as kernel
 from lidarflow.kernels.tree import Tree
 from lidarflow.open3d_import import open3d
@@ -83,7 +83,7 @@ def point_to_point(source, target, reach_m: float, start: np.ndarray) -> np.ndar
 
 def overlap(source: np.ndarray, target: Tree, reach_m: float, target_from_source: np.ndarray) -> float:
     """Share of the source (N, 3) that comes within `reach_m` of the target."""
-    distance_m, _ = tree.query(target, pose.apply(target_from_source, source), reach_m)
+    distance_m, _ = neighbours.query(target, pose.apply(target_from_source, source), reach_m)
     return float(np.isfinite(distance_m).mean())
 
 

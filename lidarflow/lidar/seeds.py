@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import coherence, tree
+from lidarflow.kernels import coherence, neighbours
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.view import View
 
@@ -41,7 +41,7 @@ def find(view: View, expected: list[Tree], config: ObjectsConfig) -> Seeds:
     shifted, shift = _shifted(view, config)
     rows = np.union1d(left, shifted)
     for body in expected:
-        rows = np.union1d(rows, tree.near_rows(view.source.tree, body, _EXPECTED_RADIUS_M))
+        rows = np.union1d(rows, neighbours.near_rows(view.source.tree, body, _EXPECTED_RADIUS_M))
     shift_of = np.full((len(rows), 3), np.nan)
     shift_of[np.searchsorted(rows, shifted)] = shift
     return Seeds(rows, shift_of)
@@ -53,7 +53,7 @@ def _left_behind(view: View) -> np.ndarray:
     if len(unexplained) == 0:
         return unexplained
     marks = np.column_stack([view.evidence.unexplained, ~view.evidence.blind])
-    around = tree.counts_around(view.source.tree, marks, view.points[unexplained], _NEIGHBOURHOOD_M)
+    around = neighbours.counts_around(view.source.tree, marks, view.points[unexplained], _NEIGHBOURHOOD_M)
     among_unexplained, among_all = around.T
     return unexplained[(among_unexplained >= _LEFT_POINTS) & (among_unexplained >= _LEFT_SHARE * among_all)]
 

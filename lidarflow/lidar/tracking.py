@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.kernels import tree
+from lidarflow.kernels import neighbours, tree
 from lidarflow.lidar.hypotheses import spread
 
 _SAME_PLACE_M = 0.5      # points this near to where a track should be lie on it
@@ -60,7 +60,7 @@ def identify(tracks: Tracks, clouds: list[np.ndarray]) -> list[int]:
     for number, points in enumerate(clouds):
         sample = spread(points, _MAX_POINTS)
         for track, place in zip(tracks.followed, places, strict=True):
-            share = len(tree.near_rows(tree.build(sample), place, _SAME_PLACE_M)) / len(sample)
+            share = len(neighbours.near_rows(tree.build(sample), place, _SAME_PLACE_M)) / len(sample)
             if share >= _MIN_SHARE:
                 overlaps.append((-share, number, track.id))
     ids: dict[int, int] = {}

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidarflow import pose
-from lidarflow.kernels import grid, tree
+from lidarflow.kernels import grid, neighbours
 from lidarflow.lidar.body import Body
 from lidarflow.lidar.surface import CAP_M, Counterparts, counterparts
 from lidarflow.lidar.view import View
@@ -60,7 +60,7 @@ def _ground(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Ground points (K, 3) of the target, one per cell, and how far over the source's they lie (K,)."""
     ground = view.ground.points
     ground = ground[grid.first_per_voxel(ground, _GROUND_CELL_M)]
-    _, row = tree.query(view.source_ground, ground, _CELL_M)
+    _, row = neighbours.query(view.source_ground, ground, _CELL_M)
     ground, row = ground[row >= 0], row[row >= 0]
     height_m = np.empty(len(view.source_ground.rows))
     height_m[view.source_ground.rows] = view.source_ground.points[:, 2]

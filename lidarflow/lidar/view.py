@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import tree
+from lidarflow.kernels import neighbours, tree
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.evidence import Evidence, gather, tolerance
 from lidarflow.lidar.surface import CAP_M, Cloud, Counterparts, Misfit, Surface, counterparts, misfit_after
@@ -72,16 +72,16 @@ def look(
     tolerance_m = tolerance(np.linalg.norm(points, axis=1), config)
     farthest_m = float(tolerance_m.max(initial=_STANDS_OUT_M))
     at_rest = counterparts(points, source.upright.normals, upright, farthest_m)
-    from_ground_m, _ = tree.query(target.ground, points, farthest_m)
+    from_ground_m, _ = neighbours.query(target.ground, points, farthest_m)
     left_m = np.minimum(at_rest.distance_m, from_ground_m)
     capped_m = np.minimum(left_m, CAP_M)
     on_plane = at_rest.within(_STANDS_OUT_M)
     plane_m = np.where(on_plane, np.minimum(np.abs(at_rest.offset_m), capped_m), capped_m)
 
     near_m = tolerance(np.linalg.norm(upright.points, axis=1), config)
-    was_there = tree.any_within(source.upright.tree, upright.points, near_m)
+    was_there = neighbours.any_within(source.upright.tree, upright.points, near_m)
     gone = np.flatnonzero(~was_there)
-    was_there[gone] = tree.any_within(source.ground, upright.points[gone], near_m[gone])
+    was_there[gone] = neighbours.any_within(source.ground, upright.points[gone], near_m[gone])
     newcomers = upright.points[~was_there]
     everything = np.concatenate([upright.points, target.ground.points])
     return View(
