@@ -9,13 +9,25 @@ import numpy as np
 from lidarflow import pose
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
-from lidarflow.lidar import dynamic, ego, features, frontend, mesh, preparation, refinement, start
+from lidarflow.lidar import (
+    attribution,
+    dynamic,
+    ego,
+    features,
+    frontend,
+    mesh,
+    preparation,
+    refinement,
+    start,
+)
 from lidarflow.lidar import uncertainty as uncertainties
-from lidarflow.lidar.attribution import WORLD, Attribution, attribute
+from lidarflow.lidar.attribution import WORLD, Attribution, Search
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.solve import solve
 from lidarflow.stopwatch import Stopwatch
 from lidarflow.types import FlowResult, Scan, ScanPair
+
+_MATCHED_NEAR_M = 1.5   # of the seeds of objects; a car's other end is farther, but has seeds of its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +51,7 @@ class Estimator(Protocol):
 def estimate_flow(pair: ScanPair, config: Config | None = None) -> FlowResult:
     """Dense rigid flow from one scan to the next; raises DataError for scans that cannot be used."""
     config = config or Config()
-    result, _ = explain(prepare(pair, config), config, Tracks())
+    result, _ = explain(prepare(pair, config), config)
     return result
 
 
@@ -64,7 +76,7 @@ class FlowEstimator:
         # Forgotten first: after a scan that cannot be used, the next pair must not inherit an older one's.
         previous, self._previous = self._previous, None
         prepared = prepare(ScanPair(source, scan), self.config, previous, guess, timed)
-        result, tracks = explain(prepared, self.config, previous.tracks if previous else Tracks())
+        result, tracks = explain(prepared, self.config)
         self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh, tracks)
         return result
 
@@ -84,7 +96,11 @@ def run(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """A pair up to the question what moves: features, ego-motion, meshes, and the graph with its matches."""
+    """A pair up to the question what moves: features, ego-motion, meshes, and the graph with its matches.
+
+    `tracks` are what earlier pairs lead to expect; `search`, where to look for objects, is None when they are
+    not looked for.
+    """
 
     pair: ScanPair
     source: features.Features
@@ -92,6 +108,8 @@ class Prepared:
     ego_motion: np.ndarray
     mesh: mesh.Mesh
     target_mesh: mesh.Mesh
+    tracks: Tracks
+    search: Search | None
     graph: frontend.Graph
     seconds: dict[str, float]
 
@@ -118,10 +136,17 @@ def prepare(
     with timed("mesh"):
         source_mesh = previous.target_mesh if previous else _mesh(pair.source, source, config)
         target_mesh = _mesh(pair.target, target, config)
+    tracks, search = previous.tracks if previous else Tracks(), None
+    if config.objects.enabled:
+        with timed("evidence"):
+            search = attribution.search(source, target, ego_motion, tracks, config)
     with timed("matching"):
-        start_motions = _start(points, previous, ego_motion, config)
-        graph = frontend.build_problem(pair, source, target, source_mesh, start_motions, config)
-    return Prepared(pair, source, target, ego_motion, source_mesh, target_mesh, graph, timed.seconds)
+        # Where nothing may have moved, matches would say what ego-motion says already.
+        sought = search.near(_MATCHED_NEAR_M) if search else np.ones(len(points), bool)
+        start_motions = _start(points, sought, previous, ego_motion, config)
+        graph = frontend.build_problem(pair, source, target, source_mesh, start_motions, config, sought)
+    return Prepared(
+        pair, source, target, ego_motion, source_mesh, target_mesh, tracks, search, graph, timed.seconds)
 
 
 def _mesh(scan: Scan, seen: features.Features, config: Config) -> mesh.Mesh:
@@ -129,17 +154,18 @@ def _mesh(scan: Scan, seen: features.Features, config: Config) -> mesh.Mesh:
         scan.points, seen.usable & ~seen.ground, seen.surface, config.mesh, config.normals.radius_m)
 
 
-def explain(prepared: Prepared, config: Config, tracks: Tracks) -> tuple[FlowResult, Tracks]:
-    """The result of a prepared pair, and the tracks of its objects that continue `tracks`."""
+def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
+    """The result of a prepared pair, and the tracks of its objects."""
     pair, source, graph, ego_motion = prepared.pair, prepared.source, prepared.graph, prepared.ego_motion
     timed = Stopwatch(dict(prepared.seconds))
     points = pair.source.points
     matches = graph.problem.points[graph.problem.match_index], graph.problem.match_target
     with timed("objects"):
         found = Attribution.none(len(points))
-        if config.objects.enabled:
+        if prepared.search:
             matched = graph.rows[graph.problem.match_index], graph.problem.match_target
-            found = attribute(pair, source, prepared.target, matched, ego_motion, tracks, config)
+            found = attribution.attribute(
+                pair, prepared.search, matched, ego_motion, prepared.tracks, config)
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
         by_group = np.concatenate([found.motions, ego_motion[None]])[found.owner]   # WORLD is the last
     with timed("solver"):
@@ -152,7 +178,7 @@ def explain(prepared: Prepared, config: Config, tracks: Tracks) -> tuple[FlowRes
         in_graph = (graph.variable >= 0) | (near_things.variable >= 0)
         is_solved = (near_things.variable >= 0) | np.append(solved, False)[graph.variable]
         is_dynamic = found.owner != WORLD
-        if not config.objects.enabled:
+        if not prepared.search:
             residual_flow = flow - (pose.apply(ego_motion, points) - points)
             is_dynamic = dynamic.detect(
                 points, residual_flow, is_solved, prepared.mesh.edges, ego_motion,
@@ -215,8 +241,8 @@ def _std(
 
 
 def _start(
-    points: np.ndarray, previous: Previous | None, ego_motion: np.ndarray, config: Config
+    points: np.ndarray, wanted: np.ndarray, previous: Previous | None, ego_motion: np.ndarray, config: Config
 ) -> np.ndarray:
     if previous is None or config.graph.start == "ego":
         return np.tile(ego_motion, (len(points), 1, 1))
-    return start.carried(points, previous.points, previous.result, ego_motion)
+    return start.carried(points, wanted, previous.points, previous.result, ego_motion)

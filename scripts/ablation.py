@@ -20,7 +20,6 @@ from evaluate import table
 from lidarflow import config as settings
 from lidarflow import pipeline, runner
 from lidarflow.datasets import Dataset, open_dataset
-from lidarflow.lidar.tracking import Tracks
 from lidarflow.types import ScanPair
 
 LEFT_OUT = {
@@ -49,7 +48,7 @@ class Case:
 
     dataset: Dataset
     index: int
-    prepared: pipeline.Prepared
+    pair: ScanPair
 
 
 def cases(folders: list[Path], n_scans: int | None) -> list[Case]:
@@ -59,7 +58,7 @@ def cases(folders: list[Path], n_scans: int | None) -> list[Case]:
         dataset = open_dataset(folder, kitti_correction=config.preparation.kitti_correction)
         scans = [dataset.scan(frame) for frame in runner.choose_frames(dataset, 0, n_scans)]
         for index, pair in enumerate(pairwise(scans)):
-            found.append(Case(dataset, index, pipeline.prepare(ScanPair(*pair), config)))
+            found.append(Case(dataset, index, ScanPair(*pair)))
     return found
 
 
@@ -75,9 +74,9 @@ def scores(with_truth: list[Case], static: list[Case], config: settings.Config) 
 
 
 def _figures(case: Case, config: settings.Config) -> dict[str, float]:
-    result, _ = pipeline.explain(case.prepared, config, Tracks())
+    result = pipeline.estimate_flow(case.pair, config)
     return runner.figures_of(
-        runner.report_pair(case.dataset, case.index, case.prepared.pair, result, config))
+        runner.report_pair(case.dataset, case.index, case.pair, result, config))
 
 
 def halved_and_doubled() -> Iterator[tuple[str, tuple[str, ...]]]:

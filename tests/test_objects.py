@@ -11,7 +11,7 @@ from lidarflow import pose, synthetic
 from lidarflow.config import ObjectsConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.kernels import links, tree
-from lidarflow.lidar import acceptance, evidence, frontend, objects, rigid_fit
+from lidarflow.lidar import acceptance, evidence, frontend, objects, rigid_fit, seeds
 from lidarflow.lidar import body as body_of
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
@@ -174,6 +174,10 @@ def test_planes_are_not_carried_along_by_rings():
     assert abs(by_points[0, 3] - 0.2) > 0.1, "nearest points follow the rings"
 
 
+def look(source: Cloud, target: Cloud, matched: np.ndarray, moved: np.ndarray) -> view_of_pair.View:
+    return view_of_pair.look(source, target, CONFIG).with_matches(matched, moved)
+
+
 def scene(car_shift: np.ndarray, seed: int, wall_shift: np.ndarray = (0.0, 0.0, 0.0)) -> view_of_pair.View:
     """A view of a box 9 m ahead that moves by `car_shift`, and a wall at 14 m along which rings may slide."""
     random = rng(seed)
@@ -188,13 +192,13 @@ def scene(car_shift: np.ndarray, seed: int, wall_shift: np.ndarray = (0.0, 0.0, 
     ground = np.column_stack([random.uniform(2, 16, 4000), random.uniform(-6, 6, 4000), np.full(4000, -0.8)])
     matched = np.arange(0, len(source), 20)
     moved = source[matched] + np.where(source[matched, :1] < 13.0, car_shift, wall_shift)
-    return view_of_pair.look(cloud(source, ground, 0.5), cloud(target, ground, 0.5), (matched, moved), CONFIG)
+    return look(cloud(source, ground, 0.5), cloud(target, ground, 0.5), matched, moved)
 
 
 @pytest.mark.parametrize("shift_m", [0.08, 0.15, 0.6, 1.4])
 def test_slow_and_fast_bodies_are_found(shift_m):
     view = scene(np.array([shift_m, 0.0, 0.0]), 11)
-    body, = objects.find(view, 0.1, CONFIG)
+    body, = objects.find(view, seeds.find(view, [], CONFIG), 0.1, CONFIG)
     on_box = view.points[:, 0] < 12.0
     assert on_box[body.rows].all() and len(body.rows) > 0.9 * on_box.sum()
     off_m = pose.apply(body.over_ground, view.points[body.rows]) - view.points[body.rows] - [shift_m, 0, 0]
@@ -202,7 +206,8 @@ def test_slow_and_fast_bodies_are_found(shift_m):
 
 
 def test_a_still_scene_has_no_body():
-    assert objects.find(scene(np.zeros(3), 12), 0.1, CONFIG) == []
+    view = scene(np.zeros(3), 12)
+    assert objects.find(view, seeds.find(view, [], CONFIG), 0.1, CONFIG) == []
 
 
 def test_a_wall_is_not_believed_to_slide_along_itself():
@@ -228,8 +233,7 @@ def test_what_the_surroundings_do_too_is_not_a_body():
     target = box_surface(6000, 19) * [3.0, 0.3, 2.0] + [12.0, 0.0, 0.0] + shift
     matched = np.arange(0, len(source), 10)
     nothing = np.empty((0, 3))
-    view = view_of_pair.look(
-        cloud(source, nothing, 0.4), cloud(target, nothing, 0.4), (matched, source[matched] + shift), CONFIG)
+    view = look(cloud(source, nothing, 0.4), cloud(target, nothing, 0.4), matched, source[matched] + shift)
     part = np.flatnonzero(np.abs(view.points[:, 0] - 12.0) < 0.8)
     body = Body(part, pose.from_translation(shift))
     assert acceptance._surroundings_gain(view, body, shift)

@@ -6,12 +6,13 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import Config
-from lidarflow.kernels import tree
-from lidarflow.lidar import objects, tracking, uncertainty
+from lidarflow.kernels import neighbours, tree
+from lidarflow.lidar import objects, seeds, tracking, uncertainty
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
 from lidarflow.lidar.features import Features
 from lidarflow.lidar.hypotheses import Expected
+from lidarflow.lidar.seeds import Seeds
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.lidar.view import View
 from lidarflow.types import MovingObject, ScanPair
@@ -47,18 +48,54 @@ class Attribution:
                    np.full(count, np.nan), (), Tracks())
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """Where in a pair to look for objects, before anything is matched.
+
+    count     int          points of the source
+    rows      (U,) int64   those of them that the view has
+    view      View         without matches
+    expected  tuple        what earlier pairs lead to expect
+    seeds     Seeds
+    """
+
+    count: int
+    rows: np.ndarray
+    view: View
+    expected: tuple[Expected, ...]
+    seeds: Seeds
+
+    def near(self, reach_m: float) -> np.ndarray:
+        """Which points of the source stand nearer than `reach_m` to a cluster of seeds: (N,)."""
+        found, seeds_tree = np.zeros(self.count, bool), tree.build(self.view.points[self.seeds.clustered()])
+        found[self.rows] = neighbours.any_within(
+            seeds_tree, self.view.points, np.full(len(self.rows), reach_m))
+        return found
+
+
+def search(
+    source: Features, target: Features, ego_motion: np.ndarray, tracks: Tracks, config: Config
+) -> Search:
+    """What the scans alone tell of moving objects; `tracks` are of the pair before, in the source's frame."""
+    moved = source.cloud.moved(ego_motion, config.shot.surface_voxel_m, config.normals.radius_m)
+    view = view_of_pair.look(moved, target.cloud, config.objects)
+    expected = _expected(tracks, ego_motion)
+    found = seeds.find(view, [e.points for e in expected], config.objects)
+    rows = np.flatnonzero(source.usable & ~source.ground)
+    return Search(len(source.usable), rows, view, expected, found)
+
+
 def attribute(
-    pair: ScanPair, source: Features, target: Features, matches: tuple[np.ndarray, np.ndarray],
-    ego_motion: np.ndarray, tracks: Tracks, config: Config,
+    pair: ScanPair, sought: Search, matches: tuple[np.ndarray, np.ndarray], ego_motion: np.ndarray,
+    tracks: Tracks, config: Config,
 ) -> Attribution:
     """Find the moving objects of a pair; matches are rows (K,) of the source and their places (K, 3).
 
     `tracks` are those of the pair before, in the frame of the source.
     """
-    points = pair.source.points
-    rows = np.flatnonzero(source.usable & ~source.ground)
-    view = _view(source, target, rows, matches, ego_motion, config)
-    bodies = objects.find(view, pair.dt_s, config.objects, _expected(tracks, ego_motion))
+    points, rows = pair.source.points, sought.rows
+    view = sought.view.with_matches(np.searchsorted(rows, matches[0]), matches[1])
+    bodies = objects.find(view, sought.seeds, pair.dt_s, config.objects, sought.expected)
 
     owner, explained = np.full(len(points), WORLD), np.zeros(len(points), bool)
     explained[rows] = ~(view.evidence.unexplained | view.evidence.blind)
@@ -76,16 +113,6 @@ def attribute(
         owner, np.array(motions).reshape(-1, 4, 4), np.array(ids, np.int32), explained,
         _std(points, rows, owner, bodies, view, ego_motion, config), described,
         tracking.advance(tracks, ids, clouds, over_ground, ego_motion))
-
-
-def _view(
-    source: Features, target: Features, rows: np.ndarray, matches: tuple[np.ndarray, np.ndarray],
-    ego_motion: np.ndarray, config: Config,
-) -> View:
-    at = np.full(len(source.usable), -1)
-    at[rows] = np.arange(len(rows))
-    moved = source.cloud.moved(ego_motion, config.shot.surface_voxel_m, config.normals.radius_m)
-    return view_of_pair.look(moved, target.cloud, (at[matches[0]], matches[1]), config.objects)
 
 
 def _expected(tracks: Tracks, ego_motion: np.ndarray) -> tuple[Expected, ...]:

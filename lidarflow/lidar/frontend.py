@@ -27,19 +27,23 @@ class Graph:
 
 
 def build_problem(
-    pair: ScanPair, source: Features, target: Features, mesh: Mesh, start: np.ndarray, config: Config
+    pair: ScanPair, source: Features, target: Features, mesh: Mesh, start: np.ndarray, config: Config,
+    sought: np.ndarray,
 ) -> Graph:
     """Variables, matches and smoothness edges of one pair (Dewan et al. 2016, section III).
 
     start (N, 4, 4) are the start values of the source's points. Points without a mesh neighbour are left
-    out. Keypoints are matched inside a gate around where their start value puts them.
+    out. Keypoints are matched inside a gate around where their start value puts them, if they are `sought`
+    (N,); the start values of others than these do not matter.
     """
     variable, rows = _variables(pair.source.points, mesh, config.graph.thinning_m)
     edges = variable[mesh.edges]
     edges = np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1)
     edges = np.unique(edges, axis=0).astype(np.int32) if config.graph.thinning_m else edges.astype(np.int32)
 
-    in_graph = np.isin(source.keypoint, rows)
+    sits_here = np.zeros(len(variable), bool)
+    sits_here[rows] = True
+    in_graph = (sits_here & sought)[source.keypoint]
     keypoint = source.keypoint[in_graph]
     target_points = pair.target.points[target.keypoint]
     query, found = matching.match(

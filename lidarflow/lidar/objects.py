@@ -4,7 +4,6 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import links
 from lidarflow.kernels import misfit as misfit_kernel
 from lidarflow.lidar import body, hypotheses, rigid_fit, seeds
 from lidarflow.lidar.acceptance import moves
@@ -13,8 +12,6 @@ from lidarflow.lidar.surface import CAP_M, MIN_AGREEMENT, Misfit
 from lidarflow.lidar.view import View
 from lidarflow.types import MovingObject
 
-_SEED_LINK_M = 0.7
-_MIN_SEEDS = 5
 _MAX_SHIFT_M = 3.0        # over ground and between scans: 30 m/s at 10 Hz
 _MAX_START_RATIO = 0.7   # of the squared misfit that ego-motion leaves
 _DISTANCE_WEIGHT = 0.3   # of squared distances to points, where those to planes have 1
@@ -22,21 +19,20 @@ _MAX_START_POINTS = 300  # as many choose the start; the fit that follows uses a
 
 
 def find(
-    view: View, dt_s: float, config: ObjectsConfig, expected: tuple[hypotheses.Expected, ...] = ()
+    view: View, found: seeds.Seeds, dt_s: float, config: ObjectsConfig,
+    expected: tuple[hypotheses.Expected, ...] = (),
 ) -> list[Body]:
-    """The moving objects of a view; no point belongs to two, and the best supported come first.
+    """The moving objects of a view, sought at seeds; no point belongs to two, the best supported come first.
 
     `expected` is what earlier pairs lead to expect: it is looked for where it should be, and believed no
     more easily than the rest.
     """
-    found = seeds.find(view, [e.points for e in expected], config)
-    clusters = _clusters(view, found)
-    starts = _best_starts(view, found, clusters, expected)
+    starts = _best_starts(view, found, found.clusters, expected)
     bodies, free = [], np.ones(len(view.points), bool)
-    for cluster, start in zip(clusters, starts, strict=True):
+    for cluster, start in zip(found.clusters, starts, strict=True):
         mine = cluster[free[found.rows[cluster]]]
         if len(mine) < len(cluster):
-            start, = _best_starts(view, found, [mine], expected)
+            start, = _best_starts(view, found, (mine,), expected)
         if start is None:
             continue
         grown = body.grown(view, found.rows[mine], start, free, config)
@@ -63,16 +59,9 @@ def describe(
     return MovingObject(number, motion, over_ground / dt_s, centre, high - low, yaw, len(points))
 
 
-def _clusters(view: View, found: seeds.Seeds) -> list[np.ndarray]:
-    """Positions (K,) in the seeds of each cluster that hangs together, the largest first."""
-    label = links.components(view.points[found.rows], _SEED_LINK_M)
-    counts = np.bincount(label)
-    members = np.split(np.argsort(label, kind="stable"), np.cumsum(counts)[:-1])
-    return [members[cluster] for cluster in np.argsort(-counts, kind="stable") if counts[cluster]]
-
-
 def _best_starts(
-    view: View, found: seeds.Seeds, clusters: list[np.ndarray], expected: tuple[hypotheses.Expected, ...]
+    view: View, found: seeds.Seeds, clusters: tuple[np.ndarray, ...],
+    expected: tuple[hypotheses.Expected, ...],
 ) -> list[np.ndarray | None]:
     """For each cluster of seeds, the motion (4, 4) that explains it best, from what is proposed for it.
 
@@ -81,7 +70,7 @@ def _best_starts(
     chosen = [hypotheses.spread(cluster, _MAX_START_POINTS) for cluster in clusters]
     rows = [found.rows[cluster] for cluster in chosen]
     proposed = [
-        (number, translation) for number, cluster in enumerate(chosen) if len(cluster) >= _MIN_SEEDS
+        (number, translation) for number, cluster in enumerate(chosen) if len(cluster) >= seeds.MIN_SEEDS
         for translation in hypotheses.translations(
             view, rows[number], found.shift[cluster], expected, _MAX_SHIFT_M)]
     if not proposed:

@@ -12,7 +12,7 @@ from lidarflow.kernels.tree import Tree
 from lidarflow.open3d_import import open3d
 
 _SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range: indoors all is smaller
-_NORMAL_RADIUS_VOXELS = 5.0
+_NORMAL_RADIUS_VOXELS = 3.5
 _MIN_POINTS = 30
 _SETTLED = 1e-7              # relative change of fit and residual that ends a point-to-point ICP
 _MOST_ROUNDS = 30

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import coherence, neighbours
+from lidarflow.kernels import coherence, links, neighbours
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.view import View
 
+MIN_SEEDS = 5            # a cluster with fewer is none
+_LINK_M = 0.7
 _NEIGHBOURHOOD_M = 0.5   # evidence is weighed over this neighbourhood
 _LEFT_SHARE = 0.35       # of what could be seen there must be unexplained
 _LEFT_POINTS = 4
@@ -22,12 +24,18 @@ _MIN_RMS_M = 0.035       # smaller distances are range noise
 class Seeds:
     """Points to look for objects at.
 
-    rows   (K,) int64   ascending rows of the view's points
-    shift  (K, 3)       the local shift over ground that planes tell, metres; NaN where they tell none
+    rows      (K,) int64   ascending rows of the view's points
+    shift     (K, 3)       the local shift over ground that planes tell, metres; NaN where they tell none
+    clusters  tuple        of positions (C,) in these: what hangs together and has enough, the largest first
     """
 
     rows: np.ndarray
     shift: np.ndarray
+    clusters: tuple[np.ndarray, ...]
+
+    def clustered(self) -> np.ndarray:
+        """The rows of all clusters."""
+        return self.rows[np.concatenate(self.clusters)] if self.clusters else self.rows[:0]
 
 
 def find(view: View, expected: list[Tree], config: ObjectsConfig) -> Seeds:
@@ -44,7 +52,15 @@ def find(view: View, expected: list[Tree], config: ObjectsConfig) -> Seeds:
         rows = np.union1d(rows, neighbours.near_rows(view.source.tree, body, _EXPECTED_RADIUS_M))
     shift_of = np.full((len(rows), 3), np.nan)
     shift_of[np.searchsorted(rows, shifted)] = shift
-    return Seeds(rows, shift_of)
+    return Seeds(rows, shift_of, _clusters(view.points[rows]))
+
+
+def _clusters(points: np.ndarray) -> tuple[np.ndarray, ...]:
+    label = links.components(points, _LINK_M)
+    counts = np.bincount(label)
+    members = np.split(np.argsort(label, kind="stable"), np.cumsum(counts)[:-1])
+    largest_first = np.argsort(-counts, kind="stable")
+    return tuple(members[cluster] for cluster in largest_first if counts[cluster] >= MIN_SEEDS)
 
 
 def _left_behind(view: View) -> np.ndarray:

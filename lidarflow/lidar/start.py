@@ -1,28 +1,29 @@
 """Start values: the motions of the previous pair, carried over to where their points are now."""
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from lidarflow.kernels import neighbours, tree
 from lidarflow.types import FlowResult
 
 _MAX_CARRY_M = 1.0
 
 
 def carried(
-    points: np.ndarray, previous_points: np.ndarray, previous: FlowResult, ego_motion: np.ndarray
+    points: np.ndarray, wanted: np.ndarray, previous_points: np.ndarray, previous: FlowResult,
+    ego_motion: np.ndarray,
 ) -> np.ndarray:
     """Start motions (N, 4, 4) of `points` (N, 3), metres in the current source frame.
 
-    Each point takes the motion of the nearest previous point after its flow (Dewan et al. 2016, section
-    IV); without a solved one within a metre, the ego-motion.
+    Each `wanted` (N,) point takes the motion of the nearest previous point after its flow (Dewan et al. 2016,
+    section IV); without a solved one within a metre, and where not wanted, the ego-motion.
     """
     start = np.tile(ego_motion, (len(points), 1, 1))
     known = np.flatnonzero(previous.valid & previous.in_graph)
-    here = np.flatnonzero(np.isfinite(points).all(axis=1))
+    here = np.flatnonzero(wanted & np.isfinite(points).all(axis=1))
     if len(known) == 0 or len(here) == 0:
         return start
     arrived = previous_points[known] + previous.flow[known]
-    distance_m, nearest = cKDTree(arrived).query(points[here], distance_upper_bound=_MAX_CARRY_M, workers=-1)
+    distance_m, nearest = neighbours.query(tree.build(arrived), points[here], _MAX_CARRY_M)
     close = np.isfinite(distance_m)
     start[here[close]] = previous.motions[known[nearest[close]]]
     return start

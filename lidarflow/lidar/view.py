@@ -4,7 +4,7 @@ All points are in the target's sensor frame after ego-motion: a static world wou
 is, and an object's motion is what it does over ground.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,19 +56,20 @@ class View:
     def points(self) -> np.ndarray:
         return self.source.points
 
+    def with_matches(self, rows: np.ndarray, places: np.ndarray) -> "View":
+        """This view with matches: rows (K,) of the source and where they are found (K, 3)."""
+        points = self.points[rows]
+        return replace(
+            self, matched=tree.build(points), match_rows=rows, match_shift=places - points)
+
     def after(self, rows: np.ndarray, over_ground: np.ndarray) -> Misfit:
         """How far the source's `rows` (K,) are from the target after the motion (4, 4)."""
         return misfit_after(self.source, rows, over_ground, self.upright, self.ground)
 
 
-def look(
-    source: Cloud, target: Cloud, matched: tuple[np.ndarray, np.ndarray], config: ObjectsConfig
-) -> View:
-    """The view of a pair, all in the target's sensor frame after ego-motion.
-
-    matched: rows (K,) of the source's upright points and their matches (K, 3).
-    """
-    points, upright, rows = source.upright.points, target.upright, matched[0]
+def look(source: Cloud, target: Cloud, config: ObjectsConfig) -> View:
+    """The view of a pair without matches, all in the target's sensor frame after ego-motion."""
+    points, upright = source.upright.points, target.upright
     tolerance_m = tolerance(np.linalg.norm(points, axis=1), config)
     farthest_m = float(tolerance_m.max(initial=_STANDS_OUT_M))
     at_rest = counterparts(points, source.upright.normals, upright, farthest_m)
@@ -87,4 +88,4 @@ def look(
     return View(
         source.upright, tolerance_m, gather(points, left_m, tolerance_m, everything),
         Misfit(capped_m, plane_m), at_rest, upright, target.ground, source.ground, ~was_there, newcomers,
-        tree.build(newcomers), tree.build(points[rows]), rows, matched[1] - points[rows])
+        tree.build(newcomers), tree.NOTHING, np.empty(0, np.int64), np.empty((0, 3)))
