@@ -13,6 +13,7 @@ import typer
 from lidarflow import __version__
 from lidarflow.errors import LidarflowError
 from lidarflow.rgbd_cli import app as rgbd_app
+from lidarflow.terminal import announce_first_use as _announce_first_use
 from lidarflow.terminal import check_live_view as _check_live_view
 from lidarflow.terminal import progress as _progress
 from lidarflow.terminal import show as _print
@@ -109,6 +110,7 @@ def pair(
     _check_live_view(visualize)
     correction = settings.preparation.kitti_correction
     scans = ScanPair(datasets.read_scan(source, correction), datasets.read_scan(target, correction))
+    _announce_first_use()
     with _working(f"flow from {source.name} to {target.name}"):
         result = chosen.estimate(scans, settings)
         alignment = metrics.alignment(scans.source, scans.target, result, settings.crispness.sigma_m)
@@ -321,6 +323,7 @@ def _open(data: Path, dataloader: str | None, sequence: str | None, settings: "C
 @contextlib.contextmanager
 def _pairs_done(pairs: int):
     """A bar on standard error; yields what to call with the name of every finished pair."""
+    _announce_first_use()
     with _progress("scan pairs", pairs) as progress:
         yield lambda frame: progress.update(0, advance=1, description=f"scan pairs, {frame} done")
 

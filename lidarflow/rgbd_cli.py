@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidarflow.terminal import check_live_view, progress, show, working
+from lidarflow.terminal import announce_first_use, check_live_view, progress, show, working
 
 if TYPE_CHECKING:
     from lidarflow.datasets.rgbd_folders import RgbdFolder
@@ -63,6 +63,7 @@ def pair(
     rgbd_methods.check(method)
     check_live_view(visualize)
     frames, origin = _read_pair(inputs, camera, intrinsics, depth_scale)
+    announce_first_use()
     with working(f"flow from {color0.name} to {color1.name}"):
         result = rgbd_methods.estimate_flow(method, frames, settings)
         report = rgbd_runner.report_pair(frames, result)
@@ -145,6 +146,7 @@ def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Pat
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(folder, jump, n_frames, "frames")
+    announce_first_use()
     with progress("frame pairs", len(frames) - 1) as bar:
 
         def on_pair(report: "RgbdReport") -> None:

@@ -34,6 +34,15 @@ def progress(what: str, total: int):
     return bar
 
 
+def announce_first_use() -> None:
+    """A line on standard error where kernels have not been compiled on this machine yet."""
+    from lidarflow.kernels.compiled import are_cached
+
+    if not are_cached():
+        console(sys.stderr).print(
+            "first use: compiling for this machine takes a minute or two; later starts skip it")
+
+
 def check_live_view(wanted: bool) -> None:
     """InstallError before any work where a viewer is wanted and none can be opened."""
     if wanted:

@@ -14,6 +14,7 @@ import math
 import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import moved, solve_positive6
 
 CHUNK = 1040             # pixels; with a power of two all rows of a chunk would share lines of the cache
@@ -22,7 +23,7 @@ _SUMS = 28               # 21 of the upper triangle of JᵀWJ, 6 of JᵀWr, 1 of
 _SMALLEST_MEAN = 1e-5    # keeps the robust scale positive where everything fits perfectly
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def look_up(target, camera, x, y, z, max_jump_m, layers, seen):
     """Fill `seen` with the first `layers` of a packed image where it sees x, y, z; False if it has no depth.
 
@@ -55,7 +56,7 @@ def look_up(target, camera, x, y, z, max_jump_m, layers, seen):
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _fill(points, source, target, camera, motion, pixels, weights, noise, weighting, max_jump_m, equations,
           largest):
     """Write the equations (2, 7, CHUNK) of some pixels, weighted, and return for how many there are any.
@@ -92,7 +93,7 @@ def _fill(points, source, target, camera, motion, pixels, weights, noise, weight
     return count
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _write(equations, column, weight, ax, ay, az, x, y, z, residual):
     """d residual = a · (ω × q + v) = ω · (q × a) + v · a at the moved point q = (x, y, z)."""
     equations[0, column] = weight * (y * az - z * ay)
@@ -104,7 +105,7 @@ def _write(equations, column, weight, ax, ay, az, x, y, z, residual):
     equations[6, column] = weight * residual
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def linearise(points, source, target, camera, motion, pixels, weights, noise, weighting, max_jump_m):
     """System of the pixels (P,), numbers v W + u, how many equations each chunk has, and the largest weights.
 
@@ -128,7 +129,7 @@ def linearise(points, source, target, camera, motion, pixels, weights, noise, we
 
 
 # Sums stay in order: where they may be reordered, fresh code and code from the cache round differently.
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _absolute_sum(equations, count, scale, twist):
     t = twist.astype(np.float32)
     row0, row1, row2, row3 = equations[0], equations[1], equations[2], equations[3]
@@ -140,7 +141,7 @@ def _absolute_sum(equations, count, scale, twist):
     return scale * total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _normal_equations(equations, count, scale, twist, cauchy_sq, sums):
     """Add JᵀWJ, JᵀWr and rᵀWr of `count` equations to `sums`; W from the residuals at `twist`."""
     t = twist.astype(np.float32)
@@ -190,7 +191,7 @@ def _normal_equations(equations, count, scale, twist, cauchy_sq, sums):
         sums[k] += scale * scale * found[k]
 
 
-@numba.njit(cache=True)
+@njit()
 def _next_twist(sums, damping, twist):
     """Solve the normal equations in `sums`, write the twist, return the largest change of a part of it."""
     matrix, right = np.empty((6, 6)), np.empty(6)
@@ -212,7 +213,7 @@ def _next_twist(sums, damping, twist):
     return change
 
 
-@numba.njit(cache=True)
+@njit()
 def _chunk_sums(equations, count, scales, twist, cauchy, sums):
     """Add what one chunk of equations gives to `sums`, absolute residuals to the first if `cauchy` is 0."""
     for kind in range(2):
@@ -222,7 +223,7 @@ def _chunk_sums(equations, count, scales, twist, cauchy, sums):
             _normal_equations(equations[kind], count, scales[kind], twist, cauchy * cauchy, sums)
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _sums(system, counts, scales, twist, cauchy):
     partial = np.zeros((len(counts), _SUMS))
     for chunk in numba.prange(len(counts)):
@@ -233,7 +234,7 @@ def _sums(system, counts, scales, twist, cauchy):
     return total
 
 
-@numba.njit(cache=True)
+@njit()
 def _sums_alone(system, counts, scales, twist, cauchy):
     """As `_sums`, by the calling thread."""
     total, partial = np.zeros(_SUMS), np.empty(_SUMS)
@@ -244,7 +245,7 @@ def _sums_alone(system, counts, scales, twist, cauchy):
     return total
 
 
-@numba.njit(cache=True)
+@njit()
 def solve(system, counts, scales, cauchy_scale, max_rounds, min_gain, min_step, damping, alone):
     """Twist (6,) that minimises Σ F(r + J ξ) over the equations, F the Cauchy loss (eq. 6), by IRLS.
 
@@ -269,7 +270,7 @@ def solve(system, counts, scales, cauchy_scale, max_rounds, min_gain, min_step, 
     return twist
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def solve_each(points, source, target, camera, motions, pixels, starts, noise, max_jump_m,
                photometric_weight, cauchy_scale, max_rounds, min_gain, min_step, damping):
     """Twists (K, 6) that improve the motions (K, 3, 4) of K sets of pixels, each by itself, after one warp.

@@ -9,12 +9,13 @@ import numba
 import numpy as np
 
 from lidarflow.kernels.alignment import look_up
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import moved
 
 _NEGLIGIBLE = 6.0   # exp(−6) = 0.0025: weights below it are 0
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@njit(parallel=True, error_model="numpy")
 def residuals(points, source, target, camera, motion, label, count, max_jump_m, max_depth_m, max_intensity,
               occlusion_m, max_edge_m):
     """Sums (K, 4) over the pixels of each cluster: |r_I|, |r_Z|, their weight, and the number of pixels.
@@ -53,7 +54,7 @@ def residuals(points, source, target, camera, motion, label, count, max_jump_m, 
     return total
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@njit(parallel=True, error_model="numpy")
 def misfits(points, source, target, camera, pixels, starts, motions, tried, max_jump_m, photometric_weight,
             max_intensity, max_depth_m):
     """Mean α |r_I| + |r_Z| (K, K) of set k's pixels after motion j, where tried[k, j]; infinite elsewhere.
@@ -82,7 +83,7 @@ def misfits(points, source, target, camera, pixels, starts, motions, tried, max_
     return mean
 
 
-@numba.njit(cache=True)
+@njit()
 def _neighbours(touch):
     """Clusters that touch each cluster, itself included: (K, K) int32 from the left, and how many (K,)."""
     count = len(touch)
@@ -95,7 +96,7 @@ def _neighbours(touch):
     return near, number
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _blending(point, own, centres, near, per_m2, weights):
     """Fill `weights`, of sum 1, of the clusters `near` that a point of cluster `own` may move with.
 
@@ -111,13 +112,13 @@ def _blending(point, own, centres, near, per_m2, weights):
         weights[i] /= total
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _distance_sq(a, b):
     x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     return x * x + y * y + z * z
 
 
-@numba.njit(cache=True)
+@njit()
 def members(points, label, centres, touch, per_m2, min_weight, wanted):
     """Pixels of each wanted cluster (K,) bool: numbers v W + u in ascending order, and where each set starts.
 
@@ -157,7 +158,7 @@ def members(points, label, centres, touch, per_m2, min_weight, wanted):
     return pixels, starts
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def blended_flow(points, label, centres, touch, per_m2, motions):
     """Flow (H, W, 3) float32 of points (H, W, 3) by the blended motions (K, 3, 4) of touching clusters."""
     rows, columns = label.shape
@@ -184,7 +185,7 @@ def blended_flow(points, label, centres, touch, per_m2, motions):
     return flow
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _add_flow(point, motion, weight, flow):
     x, y, z = moved(point, motion)
     flow[0] += weight * (x - point[0])

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import grid
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import solve_positive3
 
 _DAMPING = 0.02   # share of a full plane that an unseen direction is held back by
@@ -28,7 +29,7 @@ def local_shifts(
     return _local_shifts(points, points[rows], normals[rows], offsets_m[rows], keys, lower, shape, radius_m)
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _local_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m):
     n = len(points)
     shifts, counts = np.zeros((n, 3)), np.zeros(n, np.int64)
@@ -40,7 +41,7 @@ def _local_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m):
     return shifts, counts, before_m, after_m
 
 
-@numba.njit(cache=True)
+@njit()
 def _some_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m, shifts, counts, before_m,
                  after_m):
     starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
@@ -81,6 +82,6 @@ def _some_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m, s
         after_m[i] = math.sqrt(max(left_sq, 0.0) / count)
 
 
-@numba.njit(cache=True)
+@njit()
 def _distance_sq(a, b):
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2

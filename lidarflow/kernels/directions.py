@@ -2,11 +2,12 @@
 
 import math
 
-import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
 
-@numba.njit(cache=True)
+
+@njit()
 def looked_at(directions, others, max_angle_rad, least):
     """Whether (N,) at least so many of `others` (M, 3) are around each of the unit `directions` (N, 3).
 
@@ -28,14 +29,14 @@ def looked_at(directions, others, max_angle_rad, least):
     return looked
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _cell(direction, cell):
     """Its three indices, from 1 on, so that all neighbours of a cell exist."""
     return (int((direction[0] + 1.0) / cell) + 1, int((direction[1] + 1.0) / cell) + 1,
             int((direction[2] + 1.0) / cell) + 1)
 
 
-@numba.njit(cache=True)
+@njit()
 def _at_least(direction, unit, head, following, max_angle_rad, least):
     u, v, w = _cell(direction, max_angle_rad)
     count, size = 0, len(head)

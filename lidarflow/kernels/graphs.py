@@ -1,7 +1,8 @@
 """Undirected graphs as edge lists: unique edges of triangles, connected components."""
 
-import numba
 import numpy as np
+
+from lidarflow.kernels.compiled import njit
 
 
 def sides(triangles: np.ndarray, count: int) -> np.ndarray:
@@ -14,7 +15,7 @@ def components(edges: np.ndarray, count: int) -> np.ndarray:
     return _components(np.ascontiguousarray(edges), count)
 
 
-@numba.njit(cache=True)
+@njit()
 def _sides(triangles, count):
     first = np.zeros(count + 1, np.int64)    # of the edges of each lower end, later: where the next one goes
     for t in range(len(triangles)):
@@ -40,7 +41,7 @@ def _sides(triangles, count):
     return edges[:found].copy()
 
 
-@numba.njit(cache=True)
+@njit()
 def _components(edges, count):
     parent = np.arange(count)
     for e in range(len(edges)):
@@ -60,7 +61,7 @@ def _components(edges, count):
     return label
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _root(parent, i):
     while parent[i] != i:
         parent[i] = parent[parent[i]]

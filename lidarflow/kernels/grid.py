@@ -6,8 +6,9 @@ run: a query reads nine runs.
 
 import math
 
-import numba
 import numpy as np
+
+from lidarflow.kernels.compiled import njit
 
 
 def build(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -34,7 +35,7 @@ def voxels(points: np.ndarray, voxel_m: float) -> tuple[np.ndarray, np.ndarray]:
     return numbered(np.ascontiguousarray(points), float(voxel_m))
 
 
-@numba.njit(cache=True)
+@njit()
 def numbered(points, voxel_m):
     """As `voxels`, for other kernels."""
     slots = 16
@@ -63,14 +64,14 @@ def numbered(points, voxel_m):
     return number, counts[:found].copy()
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _hash(x, y, z):
     """Large primes spread cells (Teschner et al. 2003); what is above is folded into the low bits."""
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
     return mixed ^ (mixed >> 17)
 
 
-@numba.njit(cache=True)
+@njit()
 def _first_per_voxel(points, voxel_m):
     number, counts = numbered(points, voxel_m)
     first, least_sq = np.empty(len(counts), np.int64), np.full(len(counts), np.inf)
@@ -84,7 +85,7 @@ def _first_per_voxel(points, voxel_m):
     return first
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def lower_bound(keys, key):
     """Index of the first entry of sorted `keys` that is not below `key`."""
     low, high = 0, len(keys)
@@ -97,20 +98,20 @@ def lower_bound(keys, key):
     return low
 
 
-@numba.njit(cache=True)
+@njit()
 def runs(query, keys, lower, shape, cell_m, starts, ends):
     """Fill the up to nine runs [start, end) of sorted points around `query` (3,); returns how many."""
     return runs_around(cell_of(query, lower, cell_m), keys, shape, starts, ends)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def cell_of(query, lower, cell_m):
     """Indices of the cell of `query` (3,), which may lie outside the grid."""
     return (math.floor((query[0] - lower[0]) / cell_m), math.floor((query[1] - lower[1]) / cell_m),
             math.floor((query[2] - lower[2]) / cell_m))
 
 
-@numba.njit(cache=True)
+@njit()
 def runs_around(cell, keys, shape, starts, ends):
     """As `runs`, for all queries in one cell."""
     ix, iy, iz = cell

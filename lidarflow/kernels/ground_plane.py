@@ -2,15 +2,15 @@
 
 import math
 
-import numba
 import numpy as np
 
 from lidarflow.kernels import tree as trees
+from lidarflow.kernels.compiled import njit
 
 _MIN_SPREAD = 1e-3   # ground narrower than this share of its length does not tell the slope across it
 
 
-@numba.njit(cache=True)
+@njit()
 def slope(ground, centre, radius_m):
     """Rise per metre along x and y of the plane through the ground within `radius_m` of `centre` (3,).
 
@@ -40,7 +40,7 @@ def slope(ground, centre, radius_m):
     return by_x, by_y, count
 
 
-@numba.njit(cache=True)
+@njit()
 def heights(ground, x, y, radius_m):
     """z (K,) of the ground's points no farther from x, y than `radius_m`, heights not counted."""
     found, count = np.empty(len(ground.rows)), 0

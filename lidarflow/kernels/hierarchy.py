@@ -8,9 +8,9 @@ All levels are in one list of nodes, level after level, and within each level co
 
 from collections import namedtuple
 
-import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.inertia import SIZE, add_at
 
 # bounds (L, C + 1): first node of every component on every level; the level after a component's last one
@@ -61,7 +61,7 @@ def _flat(levels, all_bounds, stiffness) -> Hierarchy:
         np.empty((node[1], 3)), np.empty((edge[-1] - edge[1], SIZE)), np.empty((node[-1], SIZE)))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def weigh(hierarchy, c):
     """Fill the inertias of the edges of component c, and what they sum up to at its nodes, from `lever`."""
     bounds, up_start, up = hierarchy.bounds, hierarchy.up_start, hierarchy.up
@@ -89,7 +89,7 @@ def weigh(hierarchy, c):
                         inertias[edge_parent[e] - points_edges, k] += share
 
 
-@numba.njit(cache=True)
+@njit()
 def _rows(edges, count):
     start = np.zeros(count + 1, np.int64)
     for e in range(len(edges)):
@@ -97,7 +97,7 @@ def _rows(edges, count):
     return np.cumsum(start)
 
 
-@numba.njit(cache=True)
+@njit()
 def _reversed(up_start, up):
     """For every node the neighbours with lower numbers, and the edges to them."""
     count = len(up_start) - 1
@@ -115,7 +115,7 @@ def _reversed(up_start, up):
     return start, down, edge
 
 
-@numba.njit(cache=True)
+@njit()
 def _aggregates(up_start, up, down_start, down, bounds):
     """Aggregate (N,) of every node, a node with all its neighbours where these are free, then what is left.
 
@@ -160,7 +160,7 @@ def _aggregates(up_start, up, down_start, down, bounds):
     return parent, coarse_bounds
 
 
-@numba.njit(cache=True)
+@njit()
 def _members(parent, count):
     """Start (A + 1,) of every aggregate in the list of their members, and that list."""
     start = np.zeros(count + 1, np.int64)
@@ -176,7 +176,7 @@ def _members(parent, count):
     return start, member
 
 
-@numba.njit(cache=True)
+@njit()
 def _coarse_edges(up_start, up, down_start, down, down_edge, parent, count):
     """Edges between aggregates as `up_start` and `up`, and which of them (E,) each edge is in, or -1."""
     member_start, member = _members(parent, count)

@@ -9,6 +9,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import tree as trees
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import solve_positive4
 from lidarflow.kernels.misfit import agree
 
@@ -20,7 +21,7 @@ _ROUNDING_M = 1e-9           # distances are taken as equal up to this
 _REGULARISATION = 1e-6       # share of all weight that directions nothing holds are held back by
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def onto_points(points, bounds, group, translations, target, gates_m, rounds_per_gate):
     """Motions (H, 4, 4) of groups of points onto the points of a tree, from `translations` (H, 3).
 
@@ -33,7 +34,7 @@ def onto_points(points, bounds, group, translations, target, gates_m, rounds_per
     return motions
 
 
-@numba.njit(cache=True)
+@njit()
 def _onto_points(points, target, translation, gates_m, rounds_per_gate, motion):
     centre = _mean(points)
     count = len(points)
@@ -79,7 +80,7 @@ def _onto_points(points, target, translation, gates_m, rounds_per_gate, motion):
     _about(centre, turn, shift, motion)
 
 
-@numba.njit(cache=True)
+@njit()
 def onto_planes(
     points, normals, target, target_normals, turn, shift, gates_m, up, along_ground, plane_scale_m,
     point_scale_m, point_weight, min_agreement,
@@ -124,7 +125,7 @@ def onto_planes(
     return motion
 
 
-@numba.njit(cache=True)
+@njit()
 def _add_pairs(
     points, normals, target, target_normals, centre, turn, shift, gate_m, plane_scale_m, point_scale_m,
     point_weight, min_agreement, place, asked, clear_m, matrix, right,
@@ -175,7 +176,7 @@ def _add_pairs(
     return total, count
 
 
-@numba.njit(cache=True)
+@njit()
 def follow(target, x, y, z, gate_m, i, place, asked, clear_m):
     """Nearest place to x, y, z within the gate, -1 without one, and its squared distance, for point i.
 
@@ -193,7 +194,7 @@ def follow(target, x, y, z, gate_m, i, place, asked, clear_m):
     return (place[i] if apart_sq < gate_m * gate_m else -1), apart_sq
 
 
-@numba.njit(cache=True)
+@njit()
 def _mean(points):
     mean = np.zeros(3)
     for i in range(len(points)):
@@ -204,7 +205,7 @@ def _mean(points):
     return mean
 
 
-@numba.njit(cache=True)
+@njit()
 def _about(centre, turn, shift, motion):
     """Fill `motion` (4, 4) with the turn about the vertical through `centre` and the shift that follows."""
     cosine, sine = math.cos(turn), math.sin(turn)

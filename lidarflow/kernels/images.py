@@ -9,11 +9,13 @@ import math
 import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
+
 _INTENSITY_GRAIN = 1e-6   # keep the mean of two slopes defined where both are 0
 _DEPTH_GRAIN_M = 0.005
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def resize(intensity, depth, width, height, max_jump_m):
     """Area mean of intensity and a surface's mean depth, both (height, width), of larger images (H, W).
 
@@ -44,7 +46,7 @@ def resize(intensity, depth, width, height, max_jump_m):
     return small_intensity, small_depth
 
 
-@numba.njit(cache=True)
+@njit()
 def _surface_depth(readings, count, max_jump_m):
     """Mean of the first `count` readings near their lower median; 0 without any. Sorts them in place."""
     if count == 0:
@@ -59,7 +61,7 @@ def _surface_depth(readings, count, max_jump_m):
     return total / near
 
 
-@numba.njit(cache=True)
+@njit()
 def _sort(values, count):
     for k in range(1, count):
         value = values[k]
@@ -70,7 +72,7 @@ def _sort(values, count):
         values[j + 1] = value
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def halve(intensity, depth, max_jump_m):
     """The next level (H // 2, W // 2) of a pyramid: a 4x4 binomial window over one surface.
 
@@ -113,7 +115,7 @@ def halve(intensity, depth, max_jump_m):
     return small_intensity, small_depth
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def pack(intensity, depth):
     """Packed image (H, W, 6) float32 of an intensity and a depth image (H, W), gradients per pixel.
 
@@ -141,7 +143,7 @@ def pack(intensity, depth):
     return packed
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _slope(has_before, before, has_after, after, grain):
     if has_before and has_after:
         size_before, size_after = abs(before) + grain, abs(after) + grain

@@ -7,10 +7,12 @@ nothing.
 import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
+
 _CHUNK = 1024
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def nearest(points, centres):
     """Index (N,) int32 of the centre (K, 3) nearest to each point (N, 3); −1 where z is 0. All float32."""
     label = np.empty(len(points), np.int32)
@@ -20,7 +22,7 @@ def nearest(points, centres):
     return label
 
 
-@numba.njit(cache=True)
+@njit()
 def _label_chunk(points, centres, label):
     """As `nearest`, for so few points that everything stays in the nearest cache."""
     count = len(points)
@@ -41,7 +43,7 @@ def _label_chunk(points, centres, label):
             label[i] = -1
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _sums(points, centres):
     """Sums (K, 4) of the coordinates of the points nearest to each centre, and their number."""
     chunks = (len(points) + _CHUNK - 1) // _CHUNK
@@ -62,7 +64,7 @@ def _sums(points, centres):
     return total
 
 
-@numba.njit(cache=True)
+@njit()
 def centres(points, seeds, max_rounds, tolerance_m):
     """Centres (K, 3) float32 of the clusters of points (N, 3) float32, z > 0, grown from seeds (K, 3).
 
@@ -84,7 +86,7 @@ def centres(points, seeds, max_rounds, tolerance_m):
     return found
 
 
-@numba.njit(cache=True)
+@njit()
 def touching(label, points, count, reach_m):
     """Matrix (K, K) bool: clusters of `label` (H, W) with neighbouring pixels within `reach_m` in space.
 

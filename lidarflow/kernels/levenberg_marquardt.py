@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import multigrid, pose_graph
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.hierarchy import weigh
 
 # Where an iteration gains less than relative_tolerance of the energy, or absolute_tolerance, it is the last.
@@ -29,7 +30,7 @@ def state_at(variables: np.ndarray) -> State:
                  np.empty((2, count, 6)), np.empty((2, count), np.uint8))
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def optimise_each(factors, hierarchy, room, edge_bounds, shares, share_bounds, limits, state):
     """Move the variables to the minimum: without, then with the truncated kernels.
 
@@ -45,7 +46,7 @@ def optimise_each(factors, hierarchy, room, edge_bounds, shares, share_bounds, l
     return figures
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _optimise(factors, hierarchy, room, c, edges, limits, state, figures):
     """Both steps for component c; the second starts with the smoothness that the first ended with."""
     nodes = (hierarchy.bounds[0, c], hierarchy.bounds[0, c + 1])
@@ -58,7 +59,7 @@ def _optimise(factors, hierarchy, room, c, edges, limits, state, figures):
                              smooth, here, figures[robust])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _linearise(factors, hierarchy, c, nodes, state, here):
     """Normal equations where the variables are now."""
     pose_graph.displace(state.places, state.variables, nodes, state.smoothness[here])
@@ -67,7 +68,7 @@ def _linearise(factors, hierarchy, c, nodes, state, here):
     weigh(hierarchy, c)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _energy(factors, variables, nodes, robust, smooth, state, where):
     """Energy whose smoothness is known, with its gradient."""
     first, last = nodes
@@ -76,7 +77,7 @@ def _energy(factors, variables, nodes, robust, smooth, state, where):
         factors, variables, state.places, nodes, robust, state.gradients[where], state.active[where])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _step(factors, hierarchy, room, c, nodes, edges, limits, state, robust, smooth, here, figures):
     """Optimise component c; returns the smoothness and where its gradient is, and fills `figures`."""
     first, last = nodes

@@ -2,11 +2,12 @@
 
 import math
 
-import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
 
-@numba.njit(cache=True)
+
+@njit()
 def symmetric_eigen3(a00, a01, a02, a11, a12, a22, values, vectors):
     """Eigenvalues (3,) ascending and unit eigenvectors (3, 3) as columns, by cyclic Jacobi rotations."""
     m = np.empty((3, 3))
@@ -49,7 +50,7 @@ def symmetric_eigen3(a00, a01, a02, a11, a12, a22, values, vectors):
                     vectors[k, j], vectors[k, j + 1] = vectors[k, j + 1], vectors[k, j]
 
 
-@numba.njit(cache=True)
+@njit()
 def plane_eigen3(a00, a01, a02, a11, a12, a22, values, normal):
     """Eigenvalues (3,) ascending, and the unit eigenvector (3,) of the least, in closed form (Smith 1961).
 
@@ -85,7 +86,7 @@ def plane_eigen3(a00, a01, a02, a11, a12, a22, values, normal):
             normal[0], normal[1], normal[2] = x / length, y / length, z / length
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def moved(point, motion):
     """Where a motion (3, 4) or (4, 4) takes a point (3,): x, y, z in metres."""
     x, y, z = point[0], point[1], point[2]
@@ -94,7 +95,7 @@ def moved(point, motion):
             motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * z + motion[2, 3])
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def turned(vector, motion):
     """Where the rotation of a motion (3, 4) or (4, 4) takes a direction (3,): x, y, z."""
     x, y, z = vector[0], vector[1], vector[2]
@@ -103,25 +104,25 @@ def turned(vector, motion):
             motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * z)
 
 
-@numba.njit(cache=True)
+@njit()
 def solve_positive6(matrix, right):
     """Solve matrix x = right, positive definite (6, 6); x replaces right (6,), and matrix is overwritten."""
     _solve_positive(matrix, right, 6)
 
 
-@numba.njit(cache=True)
+@njit()
 def solve_positive3(matrix, right):
     """Solve matrix x = right, positive definite (3, 3); x replaces right (3,), and matrix is overwritten."""
     _solve_positive(matrix, right, 3)
 
 
-@numba.njit(cache=True)
+@njit()
 def solve_positive4(matrix, right):
     """Solve matrix x = right, positive definite (4, 4); x replaces right (4,), and matrix is overwritten."""
     _solve_positive(matrix, right, 4)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _solve_positive(matrix, right, size):
     """By Cholesky's factors."""
     for j in range(size):

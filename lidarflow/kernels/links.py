@@ -2,11 +2,11 @@
 
 import math
 
-import numba
 import numpy as np
 
 from lidarflow.kernels import grid
 from lidarflow.kernels import tree as trees
+from lidarflow.kernels.compiled import njit
 
 _CELLS_PER_LINK = 3
 
@@ -20,7 +20,7 @@ def components(points: np.ndarray, link_m: float) -> np.ndarray:
     return _components(np.ascontiguousarray(points), float(link_m))
 
 
-@numba.njit(cache=True)
+@njit()
 def _components(points, link_m):
     member, means, place = _cells(points, link_m / _CELLS_PER_LINK)
     label = _linked(means, trees.grown(means), link_m)
@@ -30,7 +30,7 @@ def _components(points, link_m):
     return of_point
 
 
-@numba.njit(cache=True)
+@njit()
 def _cells(points, cell_m):
     """Cell (N,) of each point, means (V, 3) of cells from the lowest on, and the place (V,) of each there."""
     member, counts = grid.numbered(points, cell_m)
@@ -54,7 +54,7 @@ def _cells(points, cell_m):
     return member, means, place
 
 
-@numba.njit(cache=True)
+@njit()
 def _least_and_most(values):
     least = most = 0
     for i in range(len(values)):
@@ -62,7 +62,7 @@ def _least_and_most(values):
     return least, most
 
 
-@numba.njit(cache=True)
+@njit()
 def _linked(points, tree, link_m):
     """Labels (N,) of the components, in the order of their first points."""
     parent = np.arange(len(points))
@@ -83,7 +83,7 @@ def _linked(points, tree, link_m):
     return label
 
 
-@numba.njit(cache=True)
+@njit()
 def _root(parent, i):
     """The lowest member known of i's component; the way there is halved for the next time."""
     while parent[i] != i:

@@ -4,6 +4,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import grid
+from lidarflow.kernels.compiled import njit
 
 
 def best_in_gate(
@@ -25,7 +26,7 @@ def best_in_gate(
     return best, best_sq, rival_sq
 
 
-@numba.njit(cache=True, fastmath=True)
+@njit(fastmath=True)
 def _dot(a, b):
     total = np.float32(0.0)
     for k in range(len(a)):
@@ -33,7 +34,7 @@ def _dot(a, b):
     return total
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _best_in_gate(
     centres, descriptors, candidates, candidate_descriptors, keys, lower, shape, gate_m, rival_radius_m
 ):
@@ -65,6 +66,6 @@ def _best_in_gate(
     return best, best_sq, rival_sq
 
 
-@numba.njit(cache=True)
+@njit()
 def _distance_sq(a, b):
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import grid
+from lidarflow.kernels.compiled import njit
 
 _MAX_NEIGHBOURS = 100   # looked at per point, as in Marton et al. 2009
 _MAX_STAR = 16          # triangles around one point
@@ -27,7 +28,7 @@ def ring_strips(
     return triangles[:count].copy()
 
 
-@numba.njit(cache=True)
+@njit()
 def continuous(a, b, limits):
     """Whether the segment between points a and b can lie on one surface, as seen from the origin."""
     max_edge_m, max_edge_rad, max_depth_jump_m, min_sine = limits
@@ -42,7 +43,7 @@ def continuous(a, b, limits):
     return edge_sq - jump * jump >= min_sine * min_sine * edge_sq
 
 
-@numba.njit(cache=True)
+@njit()
 def _ring_strips(points, azimuth, order, bounds, limits, triangles):
     count = 0
     for ring in range(len(bounds) - 2):
@@ -80,7 +81,7 @@ def ring_edges(
     return np.sort(_ring_edges(points, order, bounds, wanted, limits), axis=1)
 
 
-@numba.njit(cache=True)
+@njit()
 def _ring_edges(points, order, bounds, wanted, limits):
     edges = np.empty((len(order), 2), np.int32)
     count = 0
@@ -93,7 +94,7 @@ def _ring_edges(points, order, bounds, wanted, limits):
     return edges[:count].copy()
 
 
-@numba.njit(cache=True)
+@njit()
 def _next_on_ring(azimuth, order, start, here, end):
     """Point after position `here` of a ring and its azimuth; past the last the first one, a turn on.
 
@@ -129,7 +130,7 @@ def tangent_stars(
     return np.stack([keys // (n * n), keys // n % n, keys % n], axis=1).astype(np.int32)
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _star_triangles(points, normals, keys, lower, shape, limits, min_agreement, max_cosine, min_cosine):
     """Triangles (N, _MAX_STAR, 3) of every point's own star, rows of -1 where there is none."""
     triangles = np.full((len(points), _MAX_STAR, 3), -1, np.int64)
@@ -170,7 +171,7 @@ def _star_triangles(points, normals, keys, lower, shape, limits, min_agreement, 
     return triangles
 
 
-@numba.njit(cache=True)
+@njit()
 def _project(points, i, normal, near, plane):
     """Coordinates (n, 2) of the points `near` in the tangent plane of point i, relative to it."""
     if abs(normal[0]) < 0.9:
@@ -189,7 +190,7 @@ def _project(points, i, normal, near, plane):
         plane[k, 0], plane[k, 1] = dx * ux + dy * uy + dz * uz, dx * vx + dy * vy + dz * vz
 
 
-@numba.njit(cache=True)
+@njit()
 def _delaunay_ring(plane):
     """Rows of `plane` (n, 2) that are Delaunay neighbours of the origin, counter-clockwise.
 
@@ -224,7 +225,7 @@ def _delaunay_ring(plane):
     return hull[:size]
 
 
-@numba.njit(cache=True)
+@njit()
 def _well_shaped(a, b, max_cosine, min_cosine):
     """Whether the origin, a and b make a counter-clockwise triangle within the angle limits."""
     if a[0] * b[1] - a[1] * b[0] <= 0.0:

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import tree as trees
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import moved, turned
 from lidarflow.kernels.tree import Tree
 
@@ -29,7 +30,7 @@ def counterparts(
     return found
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _counterparts_in_chunks(points, normals, target, target_normals, reach_m, min_agreement, row, distance_m,
                             agrees, offset_m):
     for chunk in numba.prange((len(points) + trees.CHUNK - 1) // trees.CHUNK):
@@ -38,7 +39,7 @@ def _counterparts_in_chunks(points, normals, target, target_normals, reach_m, mi
                       row[start:end], distance_m[start:end], agrees[start:end], offset_m[start:end])
 
 
-@numba.njit(cache=True)
+@njit()
 def _counterparts(points, normals, target, target_normals, reach_m, min_agreement, row, distance_m, agrees,
                   offset_m):
     for i in range(len(points)):
@@ -55,13 +56,13 @@ def _counterparts(points, normals, target, target_normals, reach_m, min_agreemen
                            + plane[2] * (target.points[place, 2] - points[i, 2]))
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def agree(normal, x, y, z, min_agreement):
     """Whether a normal (3,) and x, y, z of unit length lie along nearly one line; NaN agrees with none."""
     return abs(normal[0] * x + normal[1] * y + normal[2] * z) > min_agreement
 
 
-@numba.njit(cache=True)
+@njit()
 def after(points, normals, rows, motion, target, target_normals, beside, cap_m, min_agreement,
           distance_m, plane_m):
     """Fill distances (K,) and plane distances (K,) of the `rows` (K,) of a cloud after a motion (4, 4).
@@ -85,7 +86,7 @@ def after(points, normals, rows, motion, target, target_normals, beside, cap_m, 
 
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def mean_sq_after(points, normals, rows, bounds, group, motions, target, target_normals, beside, cap_m,
                   min_agreement, distance_weight):
     """Mean (H,) of plane² + weight · distance² after each of motions (H, 4, 4), which moves group[h].

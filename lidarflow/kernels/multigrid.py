@@ -7,10 +7,10 @@ point's twist is there (`seen`): sums over neighbours are plain sums.
 
 from collections import namedtuple
 
-import numba
 import numpy as np
 
 from lidarflow.kernels import inertia
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.rotations import cross
 
 # held (N, 10): inertia that holds each node where it is (matches, ties, damping); inverse (N, 10) of the sum
@@ -27,7 +27,7 @@ def room_for(hierarchy) -> Room:
     return Room(*(np.empty(size) for size in sizes))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def levels_of(hierarchy, c):
     """How many levels component c has."""
     bounds = hierarchy.bounds
@@ -37,7 +37,7 @@ def levels_of(hierarchy, c):
     return count
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def hold(hierarchy, room, c, places, active, data_weight, tie_weight, damping):
     """Fill `held` and `inverse` of component c, from the matches and ties that are `active` (M,)."""
     bounds, parent, incident = hierarchy.bounds, hierarchy.parent, hierarchy.incident
@@ -56,7 +56,7 @@ def hold(hierarchy, room, c, places, active, data_weight, tie_weight, damping):
                     held[parent[i], k] += held[i, k]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _see(lever, i, ox, oy, oz, vx, vy, vz):
     """What a unit inertia at a point's lever makes of a twist: a wrench about the origin."""
     x, y, z = lever[i, 0], lever[i, 1], lever[i, 2]
@@ -66,7 +66,7 @@ def _see(lever, i, ox, oy, oz, vx, vy, vz):
     return ox + tx, oy + ty, oz + tz, ux, uy, uz
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _sum(neighbours, start, end, rows):
     """Sum of the rows (6,) of some neighbours."""
     a = b = c = d = e = f = 0.0
@@ -81,12 +81,12 @@ def _sum(neighbours, start, end, rows):
     return a, b, c, d, e, f
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _set(rows, i, a, b, c, d, e, f):
     rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4], rows[i, 5] = a, b, c, d, e, f
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add(rows, i, a, b, c, d, e, f):
     rows[i, 0] += a
     rows[i, 1] += b
@@ -96,7 +96,7 @@ def _add(rows, i, a, b, c, d, e, f):
     rows[i, 5] += f
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _loaded(loads, i, s, a, b, c, d, e, f):
     """The load of a node and what its neighbours add, times s."""
     return (loads[i, 0] + s * a, loads[i, 1] + s * b, loads[i, 2] + s * c,
@@ -105,7 +105,7 @@ def _loaded(loads, i, s, a, b, c, d, e, f):
 
 # The arrays are taken out of their tuples in each of the sweeps: inner calls with them would copy it all.
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _points_down(hierarchy, room, first, last):
     """A Gauss-Seidel sweep from rest over points, in order; what is left becomes the next level's load."""
     up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
@@ -126,7 +126,7 @@ def _points_down(hierarchy, room, first, last):
             _add(loads, parent[i], s * a, s * b, s * c, s * d, s * e, s * f)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _points_up(hierarchy, room, first, last, correction):
     """Add the coarser level's twists to those of points, then a Gauss-Seidel sweep in reversed order."""
     up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
@@ -146,7 +146,7 @@ def _points_up(hierarchy, room, first, last, correction):
         _set(seen, i, a, b, c, d, e, f)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _pull(inertias, twists, edges, first_edge, neighbours, start, end):
     """What the twists of some neighbours of a coarse node add to its load."""
     a = b = c = d = e = f = 0.0
@@ -159,7 +159,7 @@ def _pull(inertias, twists, edges, first_edge, neighbours, start, end):
     return a, b, c, d, e, f
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _nodes_down(hierarchy, room, first, last):
     """As `_points_down`, for the nodes of a coarser level."""
     up_start, up, up_edge = hierarchy.up_start, hierarchy.up, hierarchy.up_edge
@@ -179,7 +179,7 @@ def _nodes_down(hierarchy, room, first, last):
             _add(loads, parent[i], a, b, c, d, e, f)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _nodes_up(hierarchy, room, first, last, correction):
     """As `_points_up`, for the nodes of a coarser level."""
     up_start, up, up_edge = hierarchy.up_start, hierarchy.up, hierarchy.up_edge
@@ -199,7 +199,7 @@ def _nodes_up(hierarchy, room, first, last, correction):
         _set(twists, i, a, b, c, d, e, f)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def cycle(hierarchy, room, c, correction):
     """One V-cycle: about the `twists` that the `loads` of the first level make of component c."""
     bounds = hierarchy.bounds
@@ -217,7 +217,7 @@ def cycle(hierarchy, room, c, correction):
         _points_up(hierarchy, room, bounds[0, c], bounds[0, c + 1], correction)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _multiply(hierarchy, room, first, last):
     """Fill `product` with the normal equations times `direction`; returns direction · product."""
     up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
@@ -240,7 +240,7 @@ def _multiply(hierarchy, room, first, last):
     return total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _turn_direction(hierarchy, room, first, last, share):
     """The next direction: the cycle's twists and a share of the last direction."""
     lever, twists, direction, seen = hierarchy.lever, room.twists, room.direction, room.direction_seen
@@ -255,7 +255,7 @@ def _turn_direction(hierarchy, room, first, last, share):
         _set(seen, i, a, b, c, d, e, f)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _dot(a, b, first, last):
     total = 0.0
     for i in range(first, last):
@@ -264,7 +264,7 @@ def _dot(a, b, first, last):
     return total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def solve(hierarchy, room, c, gradient, tolerance, enough, most, correction):
     """Fill `step` (M, 6) of component c with the twists that minimise the quadratic model of the energy.
 

@@ -5,6 +5,7 @@ import math
 import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.tree import (
     CHUNK,
     DEPTH,
@@ -51,14 +52,14 @@ def any_within(tree: Tree, points: np.ndarray, reach_m: np.ndarray) -> np.ndarra
     return _any_within(tree, np.ascontiguousarray(points), reach_m)
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _query_in_chunks(tree, points, reach_m, distance_m, row):
     for chunk in numba.prange((len(points) + CHUNK - 1) // CHUNK):
         start, end = chunk * CHUNK, (chunk + 1) * CHUNK
         _query(tree, points[start:end], reach_m, distance_m[start:end], row[start:end])
 
 
-@numba.njit(cache=True)
+@njit()
 def _query(tree, points, reach_m, distance_m, row):
     for i in range(len(points)):
         place, apart_sq = nearest(tree, points[i, 0], points[i, 1], points[i, 2], reach_m * reach_m, -1)
@@ -66,7 +67,7 @@ def _query(tree, points, reach_m, distance_m, row):
             distance_m[i], row[i] = math.sqrt(apart_sq), tree.rows[place]
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _any_within(tree, points, reach_m):
     found = np.zeros(len(points), np.bool_)
     for i in numba.prange(len(points)):
@@ -74,7 +75,7 @@ def _any_within(tree, points, reach_m):
     return found
 
 
-@numba.njit(cache=True)
+@njit()
 def _near_rows(tree, body, radius_m):
     found, count = np.empty(len(tree.rows), np.int64), 0
     leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
@@ -106,7 +107,7 @@ def _near_rows(tree, body, radius_m):
     return found[:count].copy()
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _boxes_are_near(tree, node, body, radius_sq):
     """Whether a node's box is nearer than the root of `radius_sq` to the box around the whole body."""
     apart_sq = 0.0
@@ -118,7 +119,7 @@ def _boxes_are_near(tree, node, body, radius_sq):
     return apart_sq < radius_sq
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _farthest_sq(tree, node, points, i):
     """Squared distance from point i to the farthest corner of a node's box."""
     apart_sq = 0.0
@@ -128,7 +129,7 @@ def _farthest_sq(tree, node, points, i):
     return apart_sq
 
 
-@numba.njit(cache=True)
+@njit()
 def _before(tree, marks):
     """How many (N + 1, F) points in front of each place have each mark."""
     before = np.zeros((len(marks) + 1, marks.shape[1]), np.int64)
@@ -138,14 +139,14 @@ def _before(tree, marks):
     return before
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _counts_in_chunks(tree, before, points, radius_m, counts):
     for chunk in numba.prange((len(points) + CHUNK - 1) // CHUNK):
         start, end = chunk * CHUNK, (chunk + 1) * CHUNK
         _counts_around(tree, before, points[start:end], radius_m, counts[start:end])
 
 
-@numba.njit(cache=True)
+@njit()
 def _counts_around(tree, before, points, radius_m, counts):
     """Add the counts of marks (K, F) to `counts`; a node in reach as a whole is two look-ups in `before`."""
     leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m

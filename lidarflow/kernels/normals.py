@@ -4,6 +4,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import grid
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import plane_eigen3
 
 _MIN_NEIGHBOURS = 4
@@ -20,7 +21,7 @@ def estimate(points: np.ndarray, surface: np.ndarray, radius_m: float) -> np.nda
     return _estimate(points, surface[order], keys, lower, shape, radius_m)
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _estimate(points, surface, keys, lower, shape, radius_m):
     normals = np.full((len(points), 3), np.nan)
     for chunk in numba.prange((len(points) + _CHUNK - 1) // _CHUNK):
@@ -29,7 +30,7 @@ def _estimate(points, surface, keys, lower, shape, radius_m):
     return normals
 
 
-@numba.njit(cache=True)
+@njit()
 def _estimate_some(points, surface, keys, lower, shape, radius_m, normals):
     starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
     values, across = np.empty(3), np.empty(3)
@@ -43,7 +44,7 @@ def _estimate_some(points, surface, keys, lower, shape, radius_m, normals):
         _fit(points[i], surface, radius_m * radius_m, starts, ends, run_count, values, across, normals[i])
 
 
-@numba.njit(cache=True)
+@njit()
 def _fit(p, surface, radius_sq, starts, ends, run_count, values, across, normal):
     """Fill `normal` (3,) at p (3,) from the runs of the surface around it, if it has one."""
     count = 0

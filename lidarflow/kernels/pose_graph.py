@@ -11,6 +11,7 @@ from collections import namedtuple
 import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.rotations import (
     between,
     cross,
@@ -30,7 +31,7 @@ Factors = namedtuple("Factors", (
     "tie_weight", "truncation_sq", "tie_truncation_sq"))
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def variables_of(motions, points):
     """Variables (M, 7) of motions (M, 4, 4) at points (M, 3)."""
     variables = np.empty((len(points), 7))
@@ -43,7 +44,7 @@ def variables_of(motions, points):
     return variables
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def motions_of(variables, points, rows, motions):
     """Write the motions of variables (M, 7) at points (M, 3) to `rows` (M,) of `motions` (N, 4, 4)."""
     for i in numba.prange(len(points)):
@@ -54,7 +55,7 @@ def motions_of(variables, points, rows, motions):
                 motion[k, 0] * points[i, 0] + motion[k, 1] * points[i, 1] + motion[k, 2] * points[i, 2])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _twist_error(first, i, second, j, dx, dy, dz, px, py, pz):
     """Squared norm of the twist from the pose i to the pose j, less an offset d in i's axes, seen from −p.
 
@@ -89,7 +90,7 @@ def _twist_error(first, i, second, j, dx, dy, dz, px, py, pz):
     return square, fx, fy, fz, mx, my, mz
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add(wrenches, i, places, weight, fx, fy, fz, tx, ty, tz):
     """Add a force and a torque at a variable's place, times a weight, to its wrench about the origin."""
     mx, my, mz = cross(places[i, 0], places[i, 1], places[i, 2], fx, fy, fz)
@@ -101,7 +102,7 @@ def _add(wrenches, i, places, weight, fx, fy, fz, tx, ty, tz):
     wrenches[i, 5] += weight * fz
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add_balance(wrenches, j, places, weight, first, i, second, fx, fy, fz, tx, ty, tz):
     """Add at pose j what is in balance with a force and a torque at pose i."""
     mx, my, mz = cross(
@@ -109,7 +110,7 @@ def _add_balance(wrenches, j, places, weight, first, i, second, fx, fy, fz, tx, 
     _add(wrenches, j, places, -weight, fx, fy, fz, tx + mx, ty + my, tz + mz)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def smoothness(factors, variables, places, nodes, edges, wrenches):
     """Energy of the edges from edges[0] to edges[1] (eq. 10), which are all those of the variables
     from nodes[0] to nodes[1], whose gradient is written to `wrenches` (M, 6)."""
@@ -131,7 +132,7 @@ def smoothness(factors, variables, places, nodes, edges, wrenches):
     return 0.5 * weight * total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def evidence(factors, variables, places, nodes, robust, wrenches, active):
     """Energy of the matches and ties of the variables from nodes[0] to nodes[1]; adds its gradient.
 
@@ -164,7 +165,7 @@ def evidence(factors, variables, places, nodes, robust, wrenches, active):
     return 0.5 * total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def step(variables, places, nodes, twists, moved):
     """Write the variables nodes[0] .. nodes[1], each moved by its twist of `twists` (M, 6), to `moved`."""
     for i in range(nodes[0], nodes[1]):
@@ -177,7 +178,7 @@ def step(variables, places, nodes, twists, moved):
         moved[i, 6] = variables[i, 6] + uz + twists[i, 5]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def place(factors, variables, nodes, places, levers):
     """Put the places of variables where their points are.
 
@@ -195,7 +196,7 @@ def place(factors, variables, nodes, places, levers):
             variables[i, 4] - x, variables[i, 5] - y, variables[i, 6] - z)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def displace(places, variables, nodes, wrenches):
     """Make wrenches about the origin of forces at `places` those of the same forces where the points are."""
     for i in range(nodes[0], nodes[1]):

@@ -5,6 +5,7 @@ import math
 import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.icp import follow
 from lidarflow.kernels.linalg import moved
 
@@ -42,7 +43,7 @@ def normal_equations(points, motion, target, target_normals, reach_m, pairs: Pai
 _LOWER = np.tril_indices(6)
 
 
-@numba.njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _sums(points, motion, target, target_normals, reach_m, place, asked, clear_m):
     chunks = (len(points) + _CHUNK - 1) // _CHUNK
     parts = np.zeros((chunks, 28))
@@ -55,7 +56,7 @@ def _sums(points, motion, target, target_normals, reach_m, place, asked, clear_m
     return total
 
 
-@numba.njit(cache=True)
+@njit()
 def _add(points, start, end, motion, target, target_normals, reach_m, place, asked, clear_m, total):
     row = np.empty(6)
     for i in range(start, end):

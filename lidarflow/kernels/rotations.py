@@ -2,17 +2,17 @@
 
 import math
 
-import numba
+from lidarflow.kernels.compiled import njit
 
 _SERIES_BELOW = 0.01    # squared sine of half an angle, below which the series are exact to rounding
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def cross(ax, ay, az, bx, by, bz):
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def turned(qx, qy, qz, qw, x, y, z):
     """The vector x, y, z turned by a quaternion."""
     tx, ty, tz = cross(qx, qy, qz, x, y, z)
@@ -21,7 +21,7 @@ def turned(qx, qy, qz, qw, x, y, z):
     return x + qw * tx + cx, y + qw * ty + cy, z + qw * tz + cz
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def between(ax, ay, az, aw, bx, by, bz, bw):
     """The quaternion a⁻¹ b, with w ≥ 0."""
     x = aw * bx - ax * bw - (ay * bz - az * by)
@@ -33,7 +33,7 @@ def between(ax, ay, az, aw, bx, by, bz, bw):
     return x, y, z, w
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def logarithm(x, y, z, w):
     """Rotation vector ω of a quaternion with w ≥ 0, and c and dc/d|ω|² of the inverse left Jacobian.
 
@@ -58,7 +58,7 @@ def logarithm(x, y, z, w):
     return scale * x, scale * y, scale * z, c, slope
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def inverse_jacobian(ox, oy, oz, c, sign, x, y, z):
     """J⁻¹(ω) (sign 1) or its transpose (sign −1), the inverse right Jacobian, times a vector."""
     ax, ay, az = cross(ox, oy, oz, x, y, z)
@@ -67,7 +67,7 @@ def inverse_jacobian(ox, oy, oz, c, sign, x, y, z):
     return x - half * ax + c * bx, y - half * ay + c * by, z - half * az + c * bz
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def stepped(qx, qy, qz, qw, ox, oy, oz):
     """The unit quaternion q, then a turn by about the rotation vector ω (Cayley's map)."""
     ox, oy, oz = 0.5 * ox, 0.5 * oy, 0.5 * oz
@@ -79,7 +79,7 @@ def stepped(qx, qy, qz, qw, ox, oy, oz):
     return scale * x, scale * y, scale * z, scale * w
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def from_matrix(m):
     """Unit quaternion of a rotation matrix, the first three rows and columns of `m` (Shepperd 1978)."""
     trace = m[0, 0] + m[1, 1] + m[2, 2]
@@ -98,7 +98,7 @@ def from_matrix(m):
     return scale * x, scale * y, scale * z, scale * w
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def to_matrix(x, y, z, w, matrix):
     """Fill the first three rows and columns of `matrix` with the rotation of a unit quaternion."""
     matrix[0, 0], matrix[1, 1] = 1.0 - 2.0 * (y * y + z * z), 1.0 - 2.0 * (x * x + z * z)

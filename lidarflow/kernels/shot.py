@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels import grid
+from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import symmetric_eigen3
 
 SIZE = 352
@@ -29,7 +30,7 @@ def describe(
     return _describe(keypoints, surface[order], normals[order], keys, lower, shape, radius_m, min_neighbours)
 
 
-@numba.njit(cache=True, parallel=True, fastmath={"contract", "arcp", "reassoc"})
+@njit(parallel=True, fastmath={"contract", "arcp", "reassoc"})
 def _describe(keypoints, surface, normals, keys, lower, shape, radius_m, min_neighbours):
     n = len(keypoints)
     descriptors = np.full((n, SIZE), np.nan, np.float32)
@@ -59,7 +60,7 @@ def _describe(keypoints, surface, normals, keys, lower, shape, radius_m, min_nei
     return descriptors, frames
 
 
-@numba.njit(cache=True)
+@njit()
 def _gather(keypoint, surface, starts, ends, run_count, radius_m, offsets, index):
     """How many neighbours, the keypoint left out; fills offsets (·, 4) x y z distance and surface rows."""
     count = 0
@@ -75,7 +76,7 @@ def _gather(keypoint, surface, starts, ends, run_count, radius_m, offsets, index
     return count
 
 
-@numba.njit(cache=True)
+@njit()
 def _local_frame(offsets, count, radius_m, frame):
     """Fill `frame` (rows x, y, z) from the covariance weighted by radius − distance; False if degenerate."""
     if count < _MIN_FRAME_NEIGHBOURS:
@@ -105,7 +106,7 @@ def _local_frame(offsets, count, radius_m, frame):
     return True
 
 
-@numba.njit(cache=True)
+@njit()
 def _point_to_the_majority(offsets, count, axis):
     """Flip `axis` (3,) in place when most neighbours lie on its negative side (sign disambiguation)."""
     ahead = 0
@@ -120,7 +121,7 @@ def _point_to_the_majority(offsets, count, axis):
             axis[a] = -axis[a]
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def angle(y, x):
     """atan2(y, x) to 1e-7 radians, in a quarter of its time (Abramowitz and Stegun 1964, 4.4.49)."""
     low, high = min(abs(x), abs(y)), max(abs(x), abs(y))
@@ -144,7 +145,7 @@ def angle(y, x):
     return -found if y < 0.0 else found
 
 
-@numba.njit(cache=True)
+@njit()
 def _vote(histogram, frame, offset, cosine, radius_m):
     """Add one neighbour to its bin and, linearly, to the next bin in cosine, shell, elevation and azimuth."""
     distance = offset[3]

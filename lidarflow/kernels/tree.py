@@ -6,8 +6,9 @@ are 2 i + 1 and 2 i + 2. Points lie in the order of the leaves, so that a node i
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
+
+from lidarflow.kernels.compiled import njit
 
 _LEAF = 12       # points of a leaf, about
 DEPTH = 64      # nodes that wait while one is searched, at most
@@ -47,7 +48,7 @@ def moved(tree: Tree, points: np.ndarray) -> Tree:
     return tree._replace(points=placed, boxes=boxes)
 
 
-@numba.njit(cache=True)
+@njit()
 def grown(points):
     """As `build`, for other kernels."""
     count, nodes = len(points), 1
@@ -77,7 +78,7 @@ def grown(points):
     return Tree(placed, rows, starts, ends, boxes)
 
 
-@numba.njit(cache=True)
+@njit()
 def _no_boxes(count):
     boxes = np.empty((count, 2, 3))
     for node in range(count):
@@ -86,7 +87,7 @@ def _no_boxes(count):
     return boxes
 
 
-@numba.njit(cache=True)
+@njit()
 def _moved(tree, points):
     nodes = len(tree.ends)
     placed = np.empty_like(points)
@@ -105,7 +106,7 @@ def _moved(tree, points):
     return placed, boxes
 
 
-@numba.njit(cache=True)
+@njit()
 def _part(points, rows, axis, start, end, middle):
     """Reorder start..end so that nothing before `middle` lies beyond anything after it (Hoare 1961)."""
     left, right = start, end - 1
@@ -131,12 +132,12 @@ def _part(points, rows, axis, start, end, middle):
             return
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _median(a, b, c):
     return max(min(a, b), min(max(a, b), c))
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def box_distance_sq(tree, node, x, y, z):
     """Squared distance of x, y, z from a node's box, 0 inside it."""
     dx = max(max(tree.boxes[node, 0, 0] - x, x - tree.boxes[node, 1, 0]), 0.0)
@@ -145,14 +146,14 @@ def box_distance_sq(tree, node, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def distance_sq(points, i, x, y, z):
     """Squared distance of x, y, z from point i."""
     dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
     return dx * dx + dy * dy + dz * dz
 
 
-@numba.njit(cache=True)
+@njit()
 def nearest(tree, x, y, z, best_sq, best):
     """Place in the tree of the point nearest to x, y, z, and its squared distance.
 
@@ -184,7 +185,7 @@ def nearest(tree, x, y, z, best_sq, best):
     return best, best_sq
 
 
-@numba.njit(cache=True)
+@njit()
 def nearest_two(tree, x, y, z, reach_sq):
     """Place of the point nearest to x, y, z, its squared distance, and that of the second; none has place -1.
 
@@ -217,7 +218,7 @@ def nearest_two(tree, x, y, z, reach_sq):
     return best, best_sq, second_sq
 
 
-@numba.njit(cache=True)
+@njit()
 def within(tree, x, y, z, radius_sq):
     """Place in the tree of some point whose squared distance from x, y, z is at most `radius_sq`, or -1."""
     leaves = len(tree.ends) // 2
@@ -243,7 +244,7 @@ def within(tree, x, y, z, radius_sq):
     return -1
 
 
-@numba.njit(cache=True)
+@njit()
 def all_within(tree, x, y, z, radius_sq, found):
     """Fill `found` with the places at most the root of `radius_sq` from x, y, z; returns how many."""
     leaves, count = len(tree.ends) // 2, 0

@@ -1,10 +1,11 @@
 """Most common shifts: among those that are given, and among all that lead from one cloud to another."""
 
-import numba
 import numpy as np
 
+from lidarflow.kernels.compiled import njit
 
-@numba.njit(cache=True)
+
+@njit()
 def mode(shifts, radius_m):
     """Mean (3,) of the shifts (K, 3) around the one that most others are within `radius_m` of."""
     most, best = 0, 0
@@ -24,13 +25,13 @@ def mode(shifts, radius_m):
     return mean
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _apart_sq(shifts, i, j):
     dx, dy, dz = shifts[i, 0] - shifts[j, 0], shifts[i, 1] - shifts[j, 1], shifts[i, 2] - shifts[j, 2]
     return dx * dx + dy * dy + dz * dz
 
 
-@numba.njit(cache=True)
+@njit()
 def peaks(source, target, max_shift_m, max_rise_m, cell_m, count):
     """Mean shifts (≤ count, 3) of the cells along the ground that most shifts lead to, most votes first.
 

@@ -1,0 +1,60 @@
+"""How kernels are compiled: once, into a cache that knows the sources of all of them.
+
+numba's cache watches a function's own file only: after an update it would go on using code with other files'
+old functions inside. The cache therefore has a folder for each state of the sources.
+"""
+
+import hashlib
+import tempfile
+from pathlib import Path
+
+import numba
+import platformdirs
+
+# TBB where it is too old makes numba warn on every start; OpenMP is as fast here.
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+
+
+def cache_folder(package: Path, wanted: str) -> Path:
+    """Where kernels of `package` are cached: in the `wanted` folder, beside them, or with the user's caches.
+
+    An installation may be read-only; `wanted` is what NUMBA_CACHE_DIR says, or empty.
+    """
+    digest = hashlib.sha256()
+    for source in sorted(package.glob("*.py")):
+        digest.update(source.read_bytes())
+    state = f"lidarflow-{digest.hexdigest()[:16]}"
+    if wanted:
+        return Path(wanted) / state
+    beside = package / "__pycache__" / state
+    return beside if _is_writable(beside) else Path(platformdirs.user_cache_dir("lidarflow")) / state
+
+
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+FOLDER = cache_folder(Path(__file__).parent, numba.config.CACHE_DIR)
+
+
+def njit(**options):
+    """numba.njit with `options`, cached in FOLDER; caches of other packages stay where they are."""
+
+    def compiled(function):
+        elsewhere, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(FOLDER)
+        try:
+            return numba.njit(cache=True, **options)(function)
+        finally:
+            numba.config.CACHE_DIR = elsewhere
+
+    return compiled
+
+
+def are_cached() -> bool:
+    """Whether kernels of this state have been compiled on this machine before."""
+    return next(FOLDER.rglob("*.nbi"), None) is not None
