@@ -1,4 +1,4 @@
-"""The cache of compiled kernels: it knows all sources, and survives read-only installs and two first users."""
+"""The cache of compiled kernels: it knows all sources; read-only installs and two first users are served."""
 
 import os
 import subprocess
