@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -214,10 +215,9 @@ def _refined(
     if len(motions):
         surface = refinement.Surface.around(
             part.problem.points, pair.target.points, target.usable & ~target.ground, prepared.target_mesh)
-        settings = refinement.solver(config.solver, limits)
-        for _ in range(limits.rounds):
-            problem = refinement.rematched(part.problem, motions, surface, limits.reach_m)
-            motions, _, _ = solve(problem, settings, config.graph.min_matches)
+        motions = refinement.refined(
+            part.problem, motions, surface, partial(solve, min_matches=config.graph.min_matches),
+            refinement.solver(config.solver, limits), limits)
     return part, motions
 
 

@@ -4,7 +4,7 @@ Arrays keep the length and order of the input cloud; masks say what is valid. Le
 radians, times integer nanoseconds.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -152,6 +152,19 @@ class FlowProblem:
             raise ValueError("FlowProblem.edges: expected i < j in every row")
         if len(np.unique(self.match_index)) != len(self.match_index):
             raise ValueError("FlowProblem.match_index: a variable has more than one match")
+
+    def part(self, rows: np.ndarray) -> "FlowProblem":
+        """The problem of some variables, ascending rows (R,), which are whole components."""
+        kept = np.zeros(len(self.points), bool)
+        kept[rows] = True
+        position = (np.cumsum(kept) - 1).astype(np.int32)
+        matched = kept[self.match_index]
+        return replace(
+            self, points=self.points[rows], initial=self.initial[rows],
+            match_index=position[self.match_index[matched]], match_target=self.match_target[matched],
+            edges=position[self.edges[kept[self.edges[:, 0]]]],
+            component=np.unique(self.component[rows], return_inverse=True)[1].astype(np.int32),
+            group=self.group[rows] if len(self.group) else self.group)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """From two prepared scans to the factor graph: who is a neighbour of whom, and what matches what."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,22 +79,11 @@ def tied(
     ego_motion: np.ndarray,
 ) -> Graph:
     """The `kept` variables (M,) of a graph, whole components, each tied to its object or the world."""
-    problem = graph.problem
-    position = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
-    match_kept = kept[problem.match_index]
     motions = np.concatenate([ego_motion[None], object_motions])
     group = (owners(graph, object_id)[kept] + 1).astype(np.int32)   # group 0 is the static world
-    _, component = np.unique(problem.component[kept], return_inverse=True)
-    reduced = FlowProblem(
-        points=problem.points[kept],
-        initial=motions[group],
-        match_index=position[problem.match_index[match_kept]],
-        match_target=problem.match_target[match_kept],
-        edges=position[problem.edges[kept[problem.edges[:, 0]]]],
-        component=component.astype(np.int32),
-        group=group,
-        group_motions=motions,
-    )
+    part = graph.problem.part(np.flatnonzero(kept))
+    reduced = replace(part, initial=motions[group], group=group, group_motions=motions)
+    position = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
     rows = np.flatnonzero(graph.variable >= 0)
     variable = np.full(len(graph.variable), -1, np.int32)
     variable[rows] = position[graph.variable[rows]]

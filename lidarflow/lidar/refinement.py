@@ -5,6 +5,7 @@ scan's surface is. The same energy serves, its matches now the nearest places on
 every round's motions, as in ICP.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,6 +60,29 @@ class Surface:
         on_triangles = self.triangles.compute_closest_points(query)["points"].numpy().astype(np.float64)
         nearer = np.linalg.norm(on_triangles - points, axis=1) < off_m
         return np.where(nearer[:, None], on_triangles, places)
+
+
+def refined(
+    problem: FlowProblem, motions: np.ndarray, surface: Surface, solve: Callable, settings: SolverConfig,
+    config: RefineConfig,
+) -> np.ndarray:
+    """Motions (M, 4, 4) of the problem's variables on the surface, from `motions` (M, 4, 4).
+
+    solve(problem, settings) gives motions, what was solved, and more. A thing none of whose points has left
+    its group has no limbs that move, and is done.
+    """
+    motions = motions.copy()
+    rows = np.arange(len(problem.points))
+    for _ in range(config.rounds):
+        if len(rows) == 0:
+            break
+        part = problem.part(rows)
+        motions[rows], *_ = solve(rematched(part, motions[rows], surface, config.reach_m), settings)
+        by_group = pose.apply(part.group_motions[part.group], part.points)
+        apart_m = np.linalg.norm(pose.apply(motions[rows], part.points) - by_group, axis=1)
+        limbs = np.unique(part.component[apart_m > config.tie_truncation])
+        rows = rows[np.isin(part.component, limbs)]
+    return motions
 
 
 def rematched(problem: FlowProblem, motions: np.ndarray, surface: Surface, reach_m: float) -> FlowProblem:
