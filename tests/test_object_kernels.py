@@ -14,6 +14,7 @@ from lidarflow import pose
 from lidarflow.kernels import (
     directions,
     grid,
+    ground_level,
     ground_plane,
     icp,
     linalg,
@@ -346,6 +347,17 @@ def check_registration_equations(count: int) -> None:
         assert found[2] == paired.sum() > 0
 
 
+def check_ground_level(count: int) -> None:
+    ground, places = rng(40).uniform(-3, 3, (count, 3)), rng(41).uniform(-4, 4, (count, 3))
+    for count_near, reach_m in ((1, np.inf), (8, 1.2), (5, 0.8)):
+        found = ground_level.around(*ground_level.flat_tree(ground), places, count_near, reach_m)
+        apart = cdist(places[:, :2], ground[:, :2])
+        nearest = np.argsort(apart, axis=1)[:, :count_near]
+        expected = np.median(ground[nearest, 2], axis=1)
+        expected[np.sort(apart, axis=1)[:, count_near - 1] >= reach_m] = np.nan
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
 def check_all_tiny() -> None:
     """Every comparison on tiny inputs, for interpreted kernels."""
     check_tree(60)
@@ -362,6 +374,11 @@ def check_all_tiny() -> None:
     check_onto_planes(20, 20)
     check_solve_positive4(2)
     check_registration_equations(40)
+    check_ground_level(60)
+
+
+def test_ground_level():
+    check_ground_level(900)
 
 
 def test_registration_equations():

@@ -5,9 +5,9 @@ import os
 import sys
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidarflow.config import GroundConfig
+from lidarflow.kernels import ground_level
 
 _PATCHWORK_HEIGHT_M = 1.723   # the height Patchwork++ is tuned for; clouds are shifted to it
 _CELL_M = 2.0
@@ -61,8 +61,8 @@ def reflections(points: np.ndarray, kept: np.ndarray, ground: np.ndarray) -> np.
     low = np.flatnonzero(kept & ~ground)
     low = low[points[low, 2] < np.median(surface[:, 2]) - _REFLECTION_DEPTH_M]
     if len(low):
-        _, nearest = cKDTree(surface[:, :2]).query(points[low, :2], workers=-1)
-        below[low] = points[low, 2] < surface[nearest, 2] - _REFLECTION_DEPTH_M
+        level = ground_level.around(*ground_level.flat_tree(surface), points[low], 1, np.inf)
+        below[low] = points[low, 2] < level - _REFLECTION_DEPTH_M
     return below
 
 
@@ -86,14 +86,10 @@ def _filled(points: np.ndarray, rows: np.ndarray, ground: np.ndarray, height_m: 
     if not ground.any() or len(others) == 0:
         return ground
     surface = points[ground]
-    distance_m, nearest = cKDTree(surface[:, :2]).query(
-        points[others, :2], k=_FILL_NEIGHBOURS, distance_upper_bound=_FILL_RADIUS_M, workers=-1)
-    near = np.isfinite(distance_m)
-    heights = np.where(near, surface[np.minimum(nearest, len(surface) - 1), 2], np.nan)
-    enough = near.all(axis=1)
-    level = np.median(heights[enough], axis=1)
+    level = ground_level.around(
+        *ground_level.flat_tree(surface), points[others], _FILL_NEIGHBOURS, _FILL_RADIUS_M)
     filled = ground.copy()
-    filled[others[enough]] = np.abs(points[others[enough], 2] - level) <= height_m
+    filled[others] = np.abs(points[others, 2] - level) <= height_m   # not where the level is NaN
     return filled
 
 

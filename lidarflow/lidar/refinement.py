@@ -17,6 +17,7 @@ from lidarflow.lidar.mesh import Mesh
 from lidarflow.open3d_import import open3d
 from lidarflow.types import FlowProblem
 
+_TOLERANCE = 1e-2  # a gain smaller than this share ends a solution
 _MARGIN_M = 3.0   # around the things that are refined: what they may reach within a pair
 
 
@@ -97,9 +98,13 @@ def rematched(problem: FlowProblem, motions: np.ndarray, surface: Surface, reach
 
 
 def solver(config: SolverConfig, limits: RefineConfig) -> SolverConfig:
-    """The solver's settings for matches with a surface, which lie nearer than those of descriptors."""
-    return replace(config, data_weight=limits.data_weight, truncation_m=limits.reach_m,
-                   tie_weight=limits.tie_weight, tie_truncation=limits.tie_truncation)
+    """The solver's settings for matches with a surface, which lie nearer than those of descriptors.
+
+    The surface is asked again after every solution, which therefore need not be exact.
+    """
+    return replace(
+        config, relative_tolerance=_TOLERANCE, data_weight=limits.data_weight, truncation_m=limits.reach_m,
+        tie_weight=limits.tie_weight, tie_truncation=limits.tie_truncation)
 
 
 def wanted(problem: FlowProblem, is_rigid: np.ndarray, config: RefineConfig) -> np.ndarray:
