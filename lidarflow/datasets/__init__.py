@@ -29,7 +29,7 @@ _RECORDINGS = ("ouster", "velodyne")     # one file; all other loaders of ours w
 _BY_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".db3": "rosbag", ".osf": "ouster"}
 
 
-def open_dataset(folder: Path, dataloader: str | None = None, sequence: str | None = None,
+def open_dataset(folder: Path | str, dataloader: str | None = None, sequence: str | None = None,
                  kitti_correction: str = "auto") -> Dataset:
     """The data set in `folder`, by the named loader or by what lies in it.
 
