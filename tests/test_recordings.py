@@ -7,6 +7,7 @@ import sys
 from types import SimpleNamespace
 
 import numpy as np
+import nuscenes_scene
 import pytest
 from cloud_files import message
 from scipy.spatial import cKDTree
@@ -234,6 +235,26 @@ def test_point_clouds_of_any_layout():
     assert "125 bytes for 2 rows of 3 points; the recording is damaged" in message(point_cloud2.read, cloud)
     cloud.fields = fields[:2]
     assert "has the fields y, x; expected x, y and z" in message(point_cloud2.read, cloud)
+
+
+# nuScenes.
+
+def test_a_scene_of_nuscenes(tmp_path):
+    pytest.importorskip("nuscenes")
+    folder = nuscenes_scene.write_scene(tmp_path / "nuscenes")
+    assert "needs a sequence; choose one with --sequence" in message(open_dataset, folder)
+    data = open_dataset(folder, sequence="61")
+    assert (data.loader, len(data)) == ("nuscenes", 3) and "10 Hz" not in data.note
+    for index in (2, 0):
+        np.testing.assert_array_equal(data.scan(index).points, nuscenes_scene.CLOUDS[index].astype(float))
+        assert data.scan(index).time_ns == nuscenes_scene.TIMES_US[index] * 1000
+    steps_m = np.diff(data.world_from_sensor()[:, 0, 3])
+    np.testing.assert_allclose(steps_m, nuscenes_scene.STEP_M, atol=1e-3)
+    assert "not available" in message(open_dataset, folder, sequence="9999")
+
+
+def test_nuscenes_is_known_by_its_tables(tmp_path):
+    assert guess_loader(nuscenes_scene.write_scene(tmp_path)) == "nuscenes"
 
 
 # Packages.

@@ -84,6 +84,8 @@ def guess_loader(folder: Path) -> str:
         return "kitti_raw"
     if argoverse2.is_log(root) or argoverse2.log_folders(root):
         return "argoverse2"
+    if (root / "v1.0-mini" / "sample_data.json").is_file():
+        return "nuscenes"
     if (root / "img.cfg").is_file() and range_images.list_images(root):
         return "range_images"
     if suffixes.isdisjoint(clouds.FOLDER_SUFFIXES):

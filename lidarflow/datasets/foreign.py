@@ -35,6 +35,7 @@ def guarded(origin: str, action: Callable[[], T]) -> T:
         package = package_of(failure)
         raise InstallError(f"{origin} needs the package {package}; pip install {shlex.quote(package)}")
     said = " ".join(printed.getvalue().replace("--topic", "--sequence").replace("-" * 50, "").split())
+    said = said[max(said.find("[ERROR]"), 0):]     # not what was said while all was well
     reason = f"{type(failure).__name__}: {one_line(failure)}"
     if isinstance(failure, SystemExit) and said:
         reason = said

@@ -22,7 +22,7 @@ class KissLoader:
     """Scans and poses as KISS-ICP's loader of this name gives them; times assume 10 Hz.
 
     For recordings of several topics (mcap, rosbag) the sequence is the topic, and times are those of the
-    messages.
+    messages; for nuScenes it is the scene, and times are its own.
     """
 
     source: Source | None = None
@@ -46,13 +46,15 @@ class KissLoader:
         if not self._length:
             raise DataError(f"{self._origin} found no scans; is this the right folder for it?")
         self._poses = _checked_poses(vars(self._data).get("gt_poses"), self._length)
+        self._times_ns = [index * DEFAULT_PERIOD_NS for index in range(self._length)]
         self._stream = None
-        if loader in STREAMS:
+        if loader == "nuscenes":
+            self._times_ns = guarded(self._origin, lambda: _nuscenes_times(self._data))
+        elif loader in STREAMS:
             self._stream = Stream(self._from_start)
             weakref.finalize(self, _close, self._data)
-        self.note = f"read by KISS-ICP's loader '{loader}'"
-        if self._stream is None:
-            self.note += ", 10 Hz assumed"
+        assumed = "" if loader in (*STREAMS, "nuscenes") else ", 10 Hz assumed"
+        self.note = f"read by KISS-ICP's loader '{loader}'{assumed}"
         if self._correct:
             self.note += "; KITTI vertical-angle correction on"
 
@@ -83,7 +85,7 @@ class KissLoader:
         """What the loader has for `index`, and its time in ns."""
         if self._stream is not None:
             return self._stream.item(index)
-        return self._data[index], index * DEFAULT_PERIOD_NS
+        return self._data[index], self._times_ns[index]
 
     def _from_start(self) -> Iterator[tuple[Any, int]]:
         """Items of a stream and their times, from the first one on."""
@@ -93,6 +95,11 @@ class KissLoader:
             item = self._data[index]
             stamps = self._data.get_frames_timestamps()
             yield item, round(stamps[-1] * 1e9)
+
+
+def _nuscenes_times(data: Any) -> list[int]:
+    """Times in ns of all scans of a nuScenes scene, whose LiDAR turns at 20 Hz."""
+    return [data.nusc.get("sample_data", token)["timestamp"] * 1000 for token in data.lidar_tokens]
 
 
 def _end_messages(data: Any) -> None:
