@@ -12,6 +12,7 @@ test: install lint
 
 lint: install
 	$(BIN)/ruff check lidarflow scripts tests
+	$(BIN)/mypy
 
 install: system .venv/installed
 

@@ -12,6 +12,7 @@ import typer
 
 from lidarflow import __version__
 from lidarflow.errors import LidarflowError
+from lidarflow.export_cli import export
 from lidarflow.rgbd_cli import app as rgbd_app
 from lidarflow.terminal import announce_first_use as _announce_first_use
 from lidarflow.terminal import check_live_view as _check_live_view
@@ -237,6 +238,9 @@ def write_report(
         read = [report.read_run(run, report.shown_per_run(len(runs))) for run in runs]
         io.write_text(out, report.page_of(read))
     print(f"report     {out}")
+
+
+app.command()(export)
 
 
 @app.command()

@@ -6,9 +6,10 @@ key is an error that names the nearest known one. Viewer options and paths are n
 
 import difflib
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints, overload
 
 from lidarflow.errors import ConfigError
 
@@ -17,7 +18,11 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Settings = TypeVar("Settings")   # a frozen dataclass whose fields are sections, such as Config or RgbdConfig
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+# A frozen dataclass whose fields are sections, such as Config or RgbdConfig.
+Settings = TypeVar("Settings", bound="DataclassInstance")
 
 
 def setting(default: Any, effect: str, *, low: float | None = None, high: float | None = None,
@@ -201,9 +206,15 @@ class Config:
     crispness: CrispnessConfig = field(default_factory=CrispnessConfig)
 
 
-def load(
-    file: Path | None = None, overrides: tuple[str, ...] = (), kind: type[Settings] = Config
-) -> Settings:
+@overload
+def load(file: Path | str | None = None, overrides: tuple[str, ...] = ()) -> Config: ...
+
+
+@overload
+def load(file: Path | str | None, overrides: tuple[str, ...], kind: type[Settings]) -> Settings: ...
+
+
+def load(file: Path | str | None = None, overrides: tuple[str, ...] = (), kind: Any = Config) -> Any:
     """Defaults of a `kind` of settings, then a TOML file, then overrides such as "mesh.max_edge_m=0.5".
 
     Raises ConfigError for a file that cannot be read, an unknown key, or a value out of range.
@@ -235,11 +246,11 @@ def to_dict(config: Settings) -> dict:
     return asdict(config)
 
 
-def describe(kind: type[Settings] = Config) -> list[tuple[str, str, str, str]]:
+def describe(kind: "type[DataclassInstance]" = Config) -> list[tuple[str, str, str, str]]:
     """Rows (key, default, allowed, effect) for every setting of a `kind`."""
     rows = []
     for section in fields(kind):
-        defaults = section.default_factory()
+        defaults = getattr(kind(), section.name)
         for f in fields(defaults):
             meta = f.metadata
             allowed = " | ".join(meta["choices"]) if meta["choices"] else _range_text(meta)
@@ -247,7 +258,7 @@ def describe(kind: type[Settings] = Config) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def _range_text(meta: dict) -> str:
+def _range_text(meta: Mapping[str, Any]) -> str:
     low, high = meta["low"], meta["high"]
     if low is None:
         return ""

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarflow import io, metrics, provenance, runner
 from lidarflow.config import Config, load, updated
-from lidarflow.datasets import Dataset, Source, open_dataset
+from lidarflow.datasets import Dataset, Source
 from lidarflow.datasets.base import read_truth
 from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.errors import DataError
@@ -104,17 +104,12 @@ def known_pairs(run_dir: Path, numbers: Sequence[int]) -> Iterator[tuple[ScanPai
 
 def _opened(source: Source | None, data: Path | None, needed: bool, run_dir: Path) -> Dataset | None:
     """The data set of a run; None where it is not at hand and not needed either."""
-    if data is not None:
-        kept = source if source is not None else Source(data, None, None, "auto")
-        return open_dataset(data, kept.loader, kept.sequence, kept.kitti_correction)
-    if source is not None and source.folder.exists():
-        return open_dataset(source.folder, source.loader, source.sequence, source.kitti_correction)
-    if not needed:
+    at_hand = data is not None or (source is not None and source.folder.exists())
+    if not at_hand and not needed:
         return None
-    if source is None:
+    if not at_hand and source is None:
         raise DataError(f"{run_dir}: was not made from a data folder; give --truth FOLDER")
-    raise DataError(f"{source.folder}: no such folder any more, and {run_dir} was made from it; "
-                    "give --data with its new place, or --truth")
+    return provenance.opened(run_dir, source, data, ", or --truth")
 
 
 def _from_dataset(

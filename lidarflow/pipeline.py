@@ -23,10 +23,11 @@ from lidarflow.lidar import (
 )
 from lidarflow.lidar import uncertainty as uncertainties
 from lidarflow.lidar.attribution import WORLD, Attribution, Search
+from lidarflow.lidar.mesh import Mesh
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.solve import solve
 from lidarflow.stopwatch import Stopwatch
-from lidarflow.types import FlowResult, Scan, ScanPair
+from lidarflow.types import FlowResult, Scan, ScanPair, as_scan
 
 _MATCHED_NEAR_M = 1.5   # of the seeds of objects; a car's other end is farther, but has seeds of its own
 
@@ -38,7 +39,7 @@ class Previous:
     points: np.ndarray
     result: FlowResult
     target: features.Features
-    target_mesh: mesh.Mesh
+    target_mesh: Mesh
     tracks: Tracks
 
 
@@ -49,9 +50,17 @@ class Estimator(Protocol):
         """Flow from the last scan to this one; None for the first. DataError for a scan of no use."""
 
 
-def estimate_flow(pair: ScanPair, config: Config | None = None) -> FlowResult:
-    """Dense rigid flow from one scan to the next; raises DataError for scans that cannot be used."""
+def estimate_flow(
+    pair: ScanPair | tuple[Scan | np.ndarray, Scan | np.ndarray], config: Config | None = None
+) -> FlowResult:
+    """Dense rigid flow from one scan to the next, both Scans or points (N, 3) in metres.
+
+    Scans without times are taken 0.1 s apart. Raises DataError for scans that cannot be used.
+    """
     config = config or Config()
+    if not isinstance(pair, ScanPair):
+        source, target = pair
+        pair = ScanPair(as_scan(source, "source"), as_scan(target, "target"))
     result, _ = explain(prepare(pair, config), config)
     return result
 
@@ -65,12 +74,17 @@ class FlowEstimator:
         self._scan: Scan | None = None
         self._previous: Previous | None = None
 
-    def step(self, scan: Scan) -> FlowResult | None:
-        """Flow from the last scan to this one; None for the first."""
-        timed = Stopwatch()
+    def step(self, scan: Scan | np.ndarray) -> FlowResult | None:
+        """Flow from the last scan to this one, a Scan or points (N, 3) in metres; None for the first.
+
+        Scans without times are taken 0.1 s apart. Raises DataError for a scan that cannot be used; the next
+        one starts anew from it.
+        """
+        timed, scan = Stopwatch(), as_scan(scan)
         with timed("ego-motion"):
             guess = self._odometry.step(scan.points)
-        source, self._scan = self._scan, scan
+        source = self._scan
+        self._scan = scan
         if source is None:
             preparation.require_points(scan, self.config.preparation)
             return None
@@ -86,11 +100,11 @@ def run(
     dataset: Dataset, frames: list[int], estimator: Estimator
 ) -> Iterator[tuple[ScanPair, FlowResult]]:
     """Flow of every consecutive pair of `frames` of a data set, in order, by a fresh estimator."""
-    source = None
+    source: Scan | None = None
     for frame in frames:
         scan = dataset.scan(frame)
         result = estimator.step(scan)
-        if result is not None:
+        if source is not None and result is not None:
             yield ScanPair(source, scan), result
         source = scan
 
@@ -107,8 +121,8 @@ class Prepared:
     source: features.Features
     target: features.Features
     ego_motion: np.ndarray
-    mesh: mesh.Mesh
-    target_mesh: mesh.Mesh
+    mesh: Mesh
+    target_mesh: Mesh
     tracks: Tracks
     search: Search | None
     graph: frontend.Graph
@@ -150,7 +164,7 @@ def prepare(
         pair, source, target, ego_motion, source_mesh, target_mesh, tracks, search, graph, timed.seconds)
 
 
-def _mesh(scan: Scan, seen: features.Features, config: Config) -> mesh.Mesh:
+def _mesh(scan: Scan, seen: features.Features, config: Config) -> Mesh:
     return mesh.build(
         scan.points, seen.usable & ~seen.ground, seen.surface, config.mesh, config.normals.radius_m)
 

@@ -4,6 +4,8 @@
 radians and metres, as in gtsam. A quaternion is x, y, z, w.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -30,7 +32,7 @@ def from_translation(translation: np.ndarray) -> np.ndarray:
     return from_rotation_translation(np.eye(3), translation)
 
 
-def from_yaw(yaw: float, translation: np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
+def from_yaw(yaw: float, translation: np.ndarray | Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
     """Motion (4, 4) that turns about z by `yaw` radians, then moves by `translation` metres."""
     cosine, sine = np.cos(yaw), np.sin(yaw)
     x, y, z = translation

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidarflow import io
-from lidarflow.datasets import Source
+from lidarflow.datasets import Dataset, Source, open_dataset
 from lidarflow.errors import DataError
 
 
@@ -46,3 +46,20 @@ def read(run_dir: Path) -> RunSource:
                         "expected a folder that 'lidarflow run' wrote") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{file}: damaged ({type(error).__name__}: {error}); run again") from None
+
+
+def opened(run_dir: Path, source: Source | None, data: Path | None = None, instead: str = "") -> Dataset:
+    """The data set of a run, from `source` or from `data`, where the data are now.
+
+    `instead` is what else a message may advise, e.g. ", or --truth". Raises DataError where the data are not
+    at hand.
+    """
+    if data is not None:
+        kept = source if source is not None else Source(data, None, None, "auto")
+        return open_dataset(data, kept.loader, kept.sequence, kept.kitti_correction)
+    if source is None:
+        raise DataError(f"{run_dir}: was not made from a data folder; give --data{instead}")
+    if not source.folder.exists():
+        raise DataError(f"{source.folder}: no such folder any more, and {run_dir} was made from it; "
+                        f"give --data with its new place{instead}")
+    return open_dataset(source.folder, source.loader, source.sequence, source.kitti_correction)

@@ -6,11 +6,15 @@ radians, times integer nanoseconds.
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
 from lidarflow import pose
 from lidarflow.checks import check, check_motion
+from lidarflow.errors import DataError
+
+_FILLED_IN: Any = None     # the default of an array that __post_init__ makes in the length of the others
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +36,20 @@ class Scan:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+def as_scan(scan: Scan | np.ndarray, name: str = "scan") -> Scan:
+    """A Scan as it is; points (N, 3) of any numbers, metres in the sensor frame, as a Scan without a time.
+
+    Raises DataError, which calls the points `name`, for anything else.
+    """
+    if isinstance(scan, Scan):
+        return scan
+    points = np.asarray(scan)
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise DataError(f"{name}: an array {points.shape} of {points.dtype}; expected points (N, 3); "
+                        "where rows have more columns, pass points[:, :3]")
+    return Scan(points.astype(np.float64), name=name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +100,7 @@ class Truth:
     is_dynamic: np.ndarray
     object_id: np.ndarray
     category: np.ndarray | None = None
-    is_ground: np.ndarray | None = None
+    is_ground: np.ndarray = _FILLED_IN
     origin: str = "flow"
 
     def __post_init__(self):
@@ -249,10 +267,10 @@ class FlowResult:
     seconds: dict[str, float] = field(default_factory=dict)
     match_source: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     match_target: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
-    is_ground: np.ndarray | None = None
-    object_id: np.ndarray | None = None
+    is_ground: np.ndarray = _FILLED_IN
+    object_id: np.ndarray = _FILLED_IN
     objects: tuple[MovingObject, ...] = ()
-    std_m: np.ndarray | None = None
+    std_m: np.ndarray = _FILLED_IN
 
     def __post_init__(self):
         check("FlowResult.flow", self.flow, (None, 3), "f")

@@ -293,6 +293,9 @@ class FakeLoader:
     def reset(self):
         self.resets, self.at = self.resets + 1, 0
 
+    def get_frames_timestamps(self):
+        return [1.7e9 + 0.2 * step for step in range(self.at)]
+
 
 def fake_kiss(monkeypatch, factory):
     from kiss_icp import datasets
@@ -304,7 +307,7 @@ def test_loaders_of_kiss_icp_are_wrapped_and_silenced(tmp_path, monkeypatch, cap
     data = open_dataset(tmp_path, "rosbag")
     for index in (0, 1, 1, 2, 0):
         np.testing.assert_allclose(data.scan(index).points[0], POINTS[0] + index)
-    assert data.scan(2).time_ns == 200_000_000 and data.scan(2).name == "000002"
+    assert data.scan(2).time_ns == 1_700_000_000_400_000_000 and data.scan(2).name == "000002"
     np.testing.assert_allclose(data.world_from_sensor(), pose.identity(3))
     assert len(data) == 3 and data.truth(0) is None and "rosbag" in data.note
     assert capsys.readouterr().out == ""

@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 from cloud_files import write_bin
 from command_line import Program, drive, rests
+from run_folders import OFF_M, write_run
 
-from lidarflow import io, pose, provenance, synthetic
-from lidarflow.config import load
+from lidarflow import provenance, synthetic
 from lidarflow.datasets import open_dataset
-from lidarflow.types import FlowResult, Scan, SolveStats, Truth
+from lidarflow.types import Scan, Truth
 
-CONFIG = load(overrides=("preparation.kitti_correction=off", "crispness.sigma_m=0.3"))
-STATS = SolveStats("none", 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0, {})
-OFF_M = 0.02     # every static point is off by this much, along z
 SCANS = ("000000", "000001")
 
 
@@ -36,29 +33,6 @@ def data(tmp_path):
 def run(tmp_path, data):
     """A run over the data as `lidarflow run` leaves it: moving points right, all others off by OFF_M."""
     return write_run(tmp_path / "run", open_dataset(data, kitti_correction="off"), (0, 1, 2))
-
-
-def write_run(run_dir, dataset, scans):
-    (run_dir / "flow").mkdir(parents=True)
-    io.write_toml(run_dir / "config.toml", CONFIG)
-    provenance.write(run_dir, provenance.RunSource(dataset.source, scans))
-    for index in scans[:-1]:
-        scan = dataset.scan(index)
-        file = run_dir / "flow" / f"{scan.name}.npz"
-        io.save_flow(file, scan.points, answer(scan, dataset.truth(index)), CONFIG)
-    return run_dir
-
-
-def answer(scan, truth):
-    """The true flow, static points off by OFF_M; no motion and no movers where there is no truth."""
-    n = len(scan)
-    moves, flow, ego_motion = np.zeros(n, bool), np.zeros((n, 3)), np.eye(4)
-    if truth is not None:
-        moves, flow, ego_motion = truth.is_dynamic, truth.flow.copy(), truth.ego_motion
-    flow[~moves, 2] += OFF_M
-    everywhere = np.ones(n, bool)
-    return FlowResult(flow, pose.from_translation(flow), everywhere, everywhere, moves, ego_motion, STATS,
-                      is_ground=scan.points[:, 2] < -1.7)
 
 
 def truth_folder(data):

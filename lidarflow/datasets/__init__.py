@@ -5,7 +5,7 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from lidarflow.datasets import argoverse2, clouds, kitti, kitti_tracking, range_images
+from lidarflow.datasets import argoverse2, clouds, kitti, kitti_tracking, range_images, velodyne
 from lidarflow.datasets.base import Dataset, Source
 from lidarflow.datasets.clouds import read_points, read_scan
 from lidarflow.datasets.folder import kitti_scan_folder
@@ -21,12 +21,15 @@ LOADERS = {
     "kitti_tracking": "lidarflow.datasets.kitti_tracking:KittiTracking",
     "argoverse2": "lidarflow.datasets.argoverse2:Argoverse2",
     "range_images": "lidarflow.datasets.range_images:RangeImages",
+    "ouster": "lidarflow.datasets.ouster:OusterRecording",
+    "velodyne": "lidarflow.datasets.velodyne:VelodyneRecording",
     "folder": "lidarflow.datasets.folder:CloudFolder",
 }
-_RECORDINGS = {".mcap": "mcap", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster"}
+_RECORDINGS = ("ouster", "velodyne")     # one file; all other loaders of ours want a folder
+_BY_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".db3": "rosbag", ".osf": "ouster"}
 
 
-def open_dataset(folder: Path, dataloader: str | None = None, sequence: str | None = None,
+def open_dataset(folder: Path | str, dataloader: str | None = None, sequence: str | None = None,
                  kitti_correction: str = "auto") -> Dataset:
     """The data set in `folder`, by the named loader or by what lies in it.
 
@@ -38,6 +41,8 @@ def open_dataset(folder: Path, dataloader: str | None = None, sequence: str | No
     folder = Path(folder)
     if not folder.exists():
         raise DataError(f"{folder}: no such folder")
+    if folder.suffix.lower() == ".db3" and folder.is_file():
+        folder = folder.absolute().parent     # a ROS 2 bag is a folder
     if dataloader in (None, "kitti", "kitti_raw"):
         dataloader = dataloader or guess_loader(folder)
         folder = _data_root(folder)
@@ -61,8 +66,11 @@ def guess_loader(folder: Path) -> str:
     """The loader for what lies in `folder`; DataError, which says what was found, where none fits."""
     folder = Path(folder)
     if folder.is_file():
-        if folder.suffix.lower() in _RECORDINGS:
-            return _RECORDINGS[folder.suffix.lower()]
+        suffix = folder.suffix.lower()
+        if suffix in _BY_SUFFIX:
+            return _BY_SUFFIX[suffix]
+        if suffix == ".pcap":
+            return "velodyne" if velodyne.holds_packets(folder) else "ouster"
         raise DataError(_not_a_folder(folder))
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder")
@@ -76,10 +84,12 @@ def guess_loader(folder: Path) -> str:
         return "kitti_raw"
     if argoverse2.is_log(root) or argoverse2.log_folders(root):
         return "argoverse2"
+    if (root / "v1.0-mini" / "sample_data.json").is_file():
+        return "nuscenes"
     if (root / "img.cfg").is_file() and range_images.list_images(root):
         return "range_images"
     if suffixes.isdisjoint(clouds.FOLDER_SUFFIXES):
-        if suffixes & {".bag", ".db3"}:
+        if suffixes & {".bag", ".db3"} or (".mcap" in suffixes and (root / "metadata.yaml").is_file()):
             return "rosbag"
         clouds.list_clouds(root)     # says what was found instead
     return "folder"
@@ -90,7 +100,7 @@ def _opened(folder: Path, dataloader: str, sequence: str | None, kitti_correctio
         if dataloader not in loader_names():
             raise DataError(f"unknown loader '{dataloader}'{_nearest(dataloader)}")
         return KissLoader(dataloader, folder, sequence, kitti_correction)
-    if not folder.is_dir():
+    if not folder.is_dir() and dataloader not in _RECORDINGS:
         raise DataError(_not_a_folder(folder))
     module, _, name = LOADERS[dataloader].partition(":")
     return getattr(importlib.import_module(module), name)(folder, sequence, kitti_correction)

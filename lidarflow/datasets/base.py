@@ -136,8 +136,8 @@ def rows_of_scans(row_count: int, files: Sequence[Path]) -> list[int] | None:
     """
     if row_count == len(files):
         return list(range(row_count))
-    numbers = [frame_number(file) for file in files]
-    if None in numbers or max(numbers) >= row_count:
+    numbers = [number for number in map(frame_number, files) if number is not None]
+    if len(numbers) < len(files) or max(numbers) >= row_count:
         return None
     return numbers
 
@@ -148,8 +148,8 @@ def load_truth(file: Path, scan_file: Path, next_file: Path) -> Truth | None:
     A successor whose frame number is not the next one is not the scan the truth speaks of: None.
     Raises DataError for a file that lacks a key or is not aligned with the scan.
     """
-    numbers = frame_number(scan_file), frame_number(next_file)
-    if not file.is_file() or None in numbers or numbers[1] != numbers[0] + 1:
+    number, following = frame_number(scan_file), frame_number(next_file)
+    if not file.is_file() or number is None or following != number + 1:
         return None
     return read_truth(file, len(clouds.read_points(scan_file)), scan_file.name)
 
@@ -176,7 +176,7 @@ def read_truth(file: Path, rows: int, name: str) -> Truth:
             is_dynamic=arrays["dynamic"],
             object_id=arrays["track"].astype(np.int64),
             category=arrays.get("category"),
-            is_ground=arrays.get("is_ground"),
+            is_ground=arrays["is_ground"] if "is_ground" in arrays else np.zeros(rows, bool),
         )
     except ValueError as error:
         raise DataError(f"{file}: {clouds.one_line(error)}") from None

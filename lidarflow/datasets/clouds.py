@@ -52,7 +52,7 @@ def read_points(path: Path) -> np.ndarray:
     return points
 
 
-def read_scan(path: Path, kitti_correction: str = "auto") -> Scan:
+def read_scan(path: Path | str, kitti_correction: str = "auto") -> Scan:
     """One cloud file as a Scan; "auto" corrects .bin files that lie where KITTI puts them."""
     path = Path(path)
     points = read_points(path)

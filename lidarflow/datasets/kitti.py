@@ -42,6 +42,10 @@ class KittiOdometry(ScanFiles):
         """Poses (N, 4, 4) of the LiDAR in the first camera's world, turned into the LiDAR's axes."""
         return self._poses
 
+    def camera_from_lidar(self) -> np.ndarray | None:
+        """Where the LiDAR is in the left camera's frame (4, 4): Tr of calib.txt; None where that has none."""
+        return _read_calibration(self.folder / "calib.txt")
+
 
 def sequence_folders(folder: Path) -> dict[str, Path]:
     """The sequences of a KITTI odometry folder by name."""

@@ -18,13 +18,9 @@ def read_list(path: Path) -> tuple[np.ndarray, list[str]]:
     rows = [line.split() for line in tables.read_lines(path)]
     times = []
     for row in rows:
-        try:
-            time_ns = int(Decimal(row[0]) * 10**9)
-            if len(row) != 2 or not 0 <= time_ns < 2**62:
-                raise ValueError
-        except (InvalidOperation, ValueError, OverflowError):
-            got = " ".join(row)[:60]
-            raise DataError(f"{path}: expected lines 'seconds filename', got '{got}'") from None
+        time_ns = _to_ns(row[0])
+        if time_ns is None or len(row) != 2:
+            raise DataError(f"{path}: expected lines 'seconds filename', got '{' '.join(row)[:60]}'")
         times.append(time_ns)
     order = np.argsort(np.array(times, np.int64), kind="stable")
     return np.array(times, np.int64)[order], [rows[index][1] for index in order]
@@ -62,8 +58,12 @@ def read_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
     table = tables.read_numbers(path, 8)
     if len(table) and np.linalg.norm(table[:, 4:], axis=1).min() < 0.5:
         raise DataError(f"{path}: holds a quaternion that is not of unit length; expected qx qy qz qw")
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    return np.round(table[:, 0] * 1e9).astype(np.int64), pose.from_translation_quaternion(table[:, 1:])
+    # Seconds since 1970 in float64 would be a hundred nanoseconds off.
+    times = [_to_ns(line.split()[0]) for line in tables.read_lines(path)]
+    if None in times:
+        raise DataError(f"{path}: holds a time that is none; expected seconds, not negative")
+    order = np.argsort(np.array(times, np.int64), kind="stable")
+    return np.array(times, np.int64)[order], pose.from_translation_quaternion(table[order, 1:])
 
 
 def poses_at(times_ns: np.ndarray, known_ns: np.ndarray, poses: np.ndarray) -> np.ndarray:
@@ -82,3 +82,12 @@ def poses_at(times_ns: np.ndarray, known_ns: np.ndarray, poses: np.ndarray) -> n
                 share = (time_ns - known_ns[right - 1]) / gap_ns
                 found[index] = pose.interpolate(poses[right - 1], poses[right], share)
     return found
+
+
+def _to_ns(seconds: str) -> int | None:
+    """Nanoseconds of a number of seconds, exactly; None where it is negative, too large or no number."""
+    try:
+        time_ns = int(Decimal(seconds) * 10**9)
+    except (InvalidOperation, ValueError, OverflowError):
+        return None
+    return time_ns if 0 <= time_ns < 2**62 else None

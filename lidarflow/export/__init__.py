@@ -1,0 +1,64 @@
+"""Results in the formats of others: a module for each family of formats, and all of them in FORMATS.
+
+A format is a function of (FinishedRun, out) that yields the files it has written.
+"""
+
+import difflib
+import importlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from lidarflow.errors import DataError
+from lidarflow.export.finished_run import FinishedRun
+from lidarflow.io import check_output
+
+FORMATS = {
+    "av2-v1": "lidarflow.export.argoverse2:write_v1",
+    "av2-v2": "lidarflow.export.argoverse2:write_v2",
+    "av2-v3": "lidarflow.export.argoverse2:write_v3",
+    "opensceneflow": "lidarflow.export.opensceneflow:write",
+    "ply": "lidarflow.export.ply:write",
+    "kitti": "lidarflow.export.poses:write_kitti",
+    "kitti-camera": "lidarflow.export.poses:write_kitti_camera",
+    "tum": "lidarflow.export.poses:write_tum",
+}
+POSE_FORMATS = ("kitti", "kitti-camera", "tum")     # one text file; all others fill a folder
+
+
+def export(run_dir: Path, name: str, out: Path | None = None, data: Path | None = None) -> Iterator[Path]:
+    """Write a run in the format called `name`; yields every file once it is complete.
+
+    out   a folder, or a .txt file for poses; beside the run if not given
+    data  where the run's data set is now, if not where it was
+
+    Files of the same name are replaced, other files in `out` stay. Raises DataError for an unknown format, a
+    run that is not finished and data that are not at hand; InstallError where a format's package is missing.
+    """
+    write = find(name)
+    run_dir = Path(run_dir)
+    out = default_out(run_dir, name) if out is None else Path(out)
+    if name in POSE_FORMATS:
+        check_output("--out", out, ".txt")
+    elif out.exists() and not out.is_dir():
+        raise DataError(f"--out {out}: is a file; expected a folder")
+    elif out.exists() and run_dir.exists() and out.samefile(run_dir):
+        raise DataError(f"--out {out}: is the run itself; choose another folder")
+    yield from write(FinishedRun.read(run_dir, data), out)
+
+
+def find(name: str) -> Callable[[FinishedRun, Path], Iterator[Path]]:
+    """The format called `name`; DataError, which names the nearest, where there is none."""
+    if name not in FORMATS:
+        close = difflib.get_close_matches(name, FORMATS, n=1, cutoff=0.4)
+        hint = f" - did you mean '{close[0]}'?" if close else f"; known are {', '.join(FORMATS)}"
+        raise DataError(f"unknown format '{name}'{hint}")
+    module, _, function = FORMATS[name].partition(":")
+    return getattr(importlib.import_module(module), function)
+
+
+def default_out(run_dir: Path, name: str) -> Path:
+    """Where an export goes that was given no place: beside the run, RUN_DIR-FORMAT."""
+    place = run_dir.resolve()
+    if place.parent == place:
+        raise DataError(f"{run_dir}: is no run folder; expected a folder that 'lidarflow run' wrote")
+    return run_dir.parent / f"{place.name}-{name}{'.txt' if name in POSE_FORMATS else ''}"

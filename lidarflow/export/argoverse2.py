@@ -1,0 +1,60 @@
+"""The files that Argoverse 2's scene flow challenges take: <log>/<time_ns>.feather, a row per point.
+
+v1 (2023)  flow_tx_m, flow_ty_m, flow_tz_m of the total flow, is_dynamic
+v2 (2024)  is_valid, and the flow that points do by themselves: ego-motion removed
+v3         that flow alone
+
+Flow is float16, in the axes of the target's frame. What is not known of a NaN point is NaN, and not valid.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lidarflow.errors import InstallError
+from lidarflow.export.finished_run import FinishedRun, scene_name
+from lidarflow.io import FlowFile, written_aside
+
+COLUMNS = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
+
+
+def write_v1(run: FinishedRun, out: Path) -> Iterator[Path]:
+    """Total flow, and which points move over ground."""
+    return _write(run, out, lambda found: {**_flow_columns(found.flow), "is_dynamic": found.is_dynamic})
+
+
+def write_v2(run: FinishedRun, out: Path) -> Iterator[Path]:
+    """Which rows have an answer, and the flow without ego-motion."""
+    return _write(run, out, lambda found: {
+        "is_valid": np.isfinite(found.flow).all(axis=1), **_flow_columns(_residual_flow(found))})
+
+
+def write_v3(run: FinishedRun, out: Path) -> Iterator[Path]:
+    """The flow without ego-motion."""
+    return _write(run, out, lambda found: _flow_columns(_residual_flow(found)))
+
+
+def _write(
+    run: FinishedRun, out: Path, columns_of: Callable[[FlowFile], dict[str, np.ndarray]]
+) -> Iterator[Path]:
+    try:
+        import pyarrow
+        from pyarrow import feather
+    except ImportError:
+        raise InstallError(f"{out}: .feather needs the package pyarrow; pip install pyarrow") from None
+    log = out / scene_name(run.dataset())
+    for number, _, found in run.pairs():
+        file = log / f"{run.times_ns[number]}.feather"
+        with written_aside(file) as aside:
+            feather.write_feather(pyarrow.table(columns_of(found)), str(aside))
+        yield file
+
+
+def _flow_columns(flow: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of a flow (N, 3) in metres."""
+    return {name: flow[:, axis].astype(np.float16) for axis, name in enumerate(COLUMNS)}
+
+
+def _residual_flow(found: FlowFile) -> np.ndarray:
+    return found.result().residual_flow(found.points.astype(np.float64))

@@ -1,0 +1,134 @@
+"""lidarflow as a library: short names, arrays in and out, types, and the examples of CONTRIBUTING."""
+
+import re
+import subprocess
+import sys
+import types
+import zipfile
+
+import numpy as np
+import pytest
+import typed_use
+from command_line import drive
+from shared_data import ROOT
+
+import lidarflow
+from lidarflow import datasets, pipeline
+from lidarflow.config import Config
+from lidarflow.types import Scan, ScanPair, as_scan
+
+FAST = lidarflow.load(overrides=("solver.method=fast",))
+
+
+def clouds():
+    return [scan.points for scan, _ in drive()]
+
+
+def test_the_package_offers_its_parts():
+    assert lidarflow.estimate_flow is pipeline.estimate_flow and lidarflow.Config is Config
+    assert {name for name in lidarflow.__all__ if getattr(lidarflow, name) is None} == set()
+    assert set(lidarflow.__all__) <= set(dir(lidarflow))
+    with pytest.raises(AttributeError, match="no attribute 'estimate_flows'"):
+        _ = lidarflow.estimate_flows
+
+
+def test_the_package_alone_loads_nothing_heavy():
+    code = ("import sys, lidarflow\n"
+            "print([m for m in ('numpy', 'gtsam', 'open3d', 'numba') if m in sys.modules])\n"
+            "from lidarflow import FlowEstimator\nprint('numba' in sys.modules)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\nTrue\n"
+
+
+def test_arrays_and_scans_give_the_same_flow():
+    source, target = clouds()[:2]
+    of_arrays = lidarflow.estimate_flow((source.astype(np.float32), target.astype(np.float32)), FAST)
+    pair = ScanPair(Scan(source.astype(np.float32)), Scan(target.astype(np.float32)))
+    of_scans = lidarflow.estimate_flow(pair, FAST)
+    np.testing.assert_array_equal(of_arrays.flow, of_scans.flow)
+    assert of_arrays.flow.shape == source.shape and of_arrays.flow.dtype == np.float64
+
+
+def test_a_stream_of_arrays_is_a_stream_of_scans():
+    arrays, scans = lidarflow.FlowEstimator(FAST), lidarflow.FlowEstimator(FAST)
+    results = [(arrays.step(scan.points), scans.step(scan)) for scan, _ in drive()]
+    assert results[0] == (None, None)
+    for of_array, of_scan in results[1:]:
+        np.testing.assert_array_equal(of_array.flow, of_scan.flow)
+    truth = drive()[1][1]
+    error_m = np.linalg.norm(results[2][0].flow - truth.flow, axis=1)
+    assert np.median(error_m[~truth.is_dynamic]) < 0.03
+
+
+@pytest.mark.parametrize("points, found", [
+    (np.zeros((5, 4)), "source: an array (5, 4) of float64; expected points (N, 3)"),
+    (np.zeros(3), "an array (3,) of float64"),
+    (np.array([["a", "b", "c"]]), "an array (1, 3) of <U1"),
+    ([[1, 2], [3, 4]], "an array (2, 2) of int64"),
+    (np.zeros((4, 3)), "none of 4 points lies between"),
+    (np.empty((0, 3)), "none of 0 points lies between"),
+    (np.full((4, 3), np.nan), "none of 4 points lies between")])
+def test_arrays_that_are_no_points(points, found):
+    with pytest.raises(lidarflow.LidarflowError) as caught:
+        lidarflow.estimate_flow((points, clouds()[0]))
+    assert found in str(caught.value)
+
+
+def test_whole_numbers_are_points():
+    scan = as_scan(np.array([[1, 2, 3]]), "mine")
+    assert scan.points.dtype == np.float64 and scan.name == "mine" and as_scan(scan) is scan
+
+
+def test_after_a_bad_scan_the_stream_goes_on():
+    estimator = lidarflow.FlowEstimator(FAST)
+    estimator.step(clouds()[0])
+    with pytest.raises(lidarflow.LidarflowError):
+        estimator.step(np.zeros((4, 2)))
+    assert estimator.step(clouds()[1]).flow.shape == clouds()[0].shape
+
+
+# Types.
+
+def test_the_program_that_is_type_checked_runs(kitti, scans):
+    source, target = (points.astype(np.float32) for points in clouds()[:2])
+    assert typed_use.of_two_files(scans[0], scans[1]).shape == source.shape
+    assert typed_use.of_two_arrays(source, target).flow.shape == source.shape
+    speeds = typed_use.along(kitti)
+    assert speeds and min(speeds) > 0.3
+
+
+@pytest.mark.slow
+def test_types_of_the_public_names_are_right(tmp_path):
+    pytest.importorskip("mypy")
+    words = [sys.executable, "-m", "mypy", "--cache-dir", str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_wheel_says_that_it_is_typed(tmp_path):
+    pytest.importorskip("hatchling")
+    words = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(words, capture_output=True, check=True, cwd=ROOT)
+    wheel, = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert "lidarflow/py.typed" in names and "lidarflow/export/ply.py" in names
+    assert not [name for name in names if name.startswith("tests")]
+
+
+# CONTRIBUTING.
+
+def test_a_loader_as_contributing_shows_it(tmp_path, monkeypatch):
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    loader, line = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[:2]
+    written = [row for row in loader.splitlines() if row.strip() and not row.startswith(("import", "from"))]
+    assert len(written) <= 10, "in ten lines"
+    name, place = re.search(r'"(\w+)": "([\w.]+):MyDrive"', line).groups()
+    module = types.ModuleType(place)
+    exec(compile(loader, "CONTRIBUTING.md", "exec"), module.__dict__)
+    monkeypatch.setitem(sys.modules, place, module)
+    monkeypatch.setitem(datasets.LOADERS, name, f"{place}:MyDrive")
+    for k, points in enumerate(clouds()):
+        points.astype(np.float32).tofile(tmp_path / f"{k}.xyz32")
+    data = datasets.open_dataset(tmp_path, name)
+    assert (data.loader, len(data)) == (name, 3) and data.source.loader == name
+    np.testing.assert_array_equal(data.scan(2).points, clouds()[2].astype(np.float32))
