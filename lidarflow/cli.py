@@ -13,15 +13,14 @@ import typer
 from lidarflow import __version__
 from lidarflow.errors import LidarflowError
 from lidarflow.rgbd_cli import app as rgbd_app
+from lidarflow.run_cli import pairs_done, process
 from lidarflow.terminal import check_live_view as _check_live_view
-from lidarflow.terminal import progress as _progress
 from lidarflow.terminal import show as _print
 from lidarflow.terminal import working as _working
 
 if TYPE_CHECKING:
     from lidarflow.config import Config
     from lidarflow.datasets import Dataset
-    from lidarflow.runner import Viewing
 
 _INTERRUPTED = 130     # what typer makes of Ctrl-C
 
@@ -139,19 +138,24 @@ def run(
     visualize: Visualize = False,
     arrows: Arrows = False,
     record: Annotated[bool, typer.Option(help="Write recording.rrd (about 5 MB a pair).")] = True,
+    resume: Annotated[bool, typer.Option(
+        "--resume", help="Go on with a run that was interrupted; the results are the same.")] = False,
+    skip_bad: Annotated[bool, typer.Option(
+        "--skip-bad", help="Leave out scans that cannot be used, and say which.")] = False,
     config: ConfigFile = None,
     overrides: Overrides = None,
 ) -> None:
     """Flow between all consecutive scans of a data set."""
     from lidarflow import methods
     from lidarflow.config import load
-    from lidarflow.runner import Viewing
+    from lidarflow.runner import Going, Viewing
 
     settings = load(config, _with_solver(overrides, solver))
     methods.find(method)
     dataset = _open(data, dataloader, sequence, settings)
     print(f"method     {method}")
-    _process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans, method)
+    process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans, method,
+             Going(resume, skip_bad))
 
 
 @app.command()
@@ -178,7 +182,7 @@ def compare(
         io.check_output("--out", out, ".json", inputs=(data,))
     dataset = _open(data, dataloader, sequence, settings)
     frames = runner.choose_frames(dataset, jump, n_scans)
-    with _pairs_done(len(frames) - 1) as on_pair:
+    with pairs_done(len(frames) - 1) as on_pair:
         found = comparing.compare(dataset, frames, chosen, settings, on_pair)
     print()
     _print(tables.compare_table(found))
@@ -289,7 +293,7 @@ def demo(
     settings = load(overrides=("preparation.kitti_correction=off",))
     dataset = open_dataset(folder, kitti_correction=settings.preparation.kitti_correction)
     print(f"generated  {folder}: {len(dataset)} scans with truth, in KITTI's layout")
-    _process(dataset, settings, out / generated.RUN_FOLDER, Viewing(visualize=visualize), 0, None)
+    process(dataset, settings, out / generated.RUN_FOLDER, Viewing(visualize=visualize), 0, None)
 
 
 @app.command(name="config")
@@ -316,39 +320,6 @@ def _open(data: Path, dataloader: str | None, sequence: str | None, settings: "C
     if dataset.note:
         print(f"note       {dataset.note}")
     return dataset
-
-
-@contextlib.contextmanager
-def _pairs_done(pairs: int):
-    """A bar on standard error; yields what to call with the name of every finished pair."""
-    with _progress("scan pairs", pairs) as progress:
-        yield lambda frame: progress.update(0, advance=1, description=f"scan pairs, {frame} done")
-
-
-def _process(
-    dataset: "Dataset", settings: "Config", out: Path, viewing: "Viewing", jump: int, n_scans: int | None,
-    method: str = "ours",
-) -> None:
-    from lidarflow import runner
-    from lidarflow.tables import run_notes, run_table
-
-    _check_live_view(viewing.visualize)
-    frames = runner.choose_frames(dataset, jump, n_scans)
-    with _pairs_done(len(frames) - 1) as on_pair:
-        reports = runner.process(
-            dataset, frames, settings, out, viewing, lambda report: on_pair(report.frame), method)
-    print()
-    _print(run_table(reports, settings))
-    print()
-    for note in run_notes(reports, settings):
-        print(note)
-    print()
-    print(f"results    {out}")
-    print(f"metrics    {out / 'metrics.json'}")
-    print(f"picture    {out / 'preview.png'}   (the last pair)")
-    if viewing.record:
-        print(f"recording  {out / 'recording.rrd'}")
-        print(f"look at it with: lidarflow view {out}")
 
 
 def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None:

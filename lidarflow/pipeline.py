@@ -20,20 +20,33 @@ from lidarflow.types import FlowResult, Scan, ScanPair
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Previous:
-    """What one pair leaves for the next: source points and result, its target's features and mesh, tracks."""
+    """What one pair leaves for the next: source points and result, its target's features and mesh.
+
+    Features and mesh are None where the result was known already; they are made again when they are needed.
+    """
 
     points: np.ndarray
     result: FlowResult
-    target: features.Features
-    target_mesh: mesh.Mesh
-    tracks: Tracks
+    target: features.Features | None = None
+    target_mesh: mesh.Mesh | None = None
 
 
 class Estimator(Protocol):
-    """A method that is shown the scans of a sequence one by one."""
+    """A method that is shown the scans of a sequence one by one.
+
+    tracks  the objects that are followed, and the first number that is still free
+    """
+
+    tracks: Tracks
 
     def step(self, scan: Scan) -> FlowResult | None:
         """Flow from the last scan to this one; None for the first. DataError for a scan of no use."""
+
+    def follow(self, scan: Scan, known: FlowResult, tracks: Tracks) -> None:
+        """As `step` where its answer and the tracks after it are known: the next step is the same."""
+
+    def reset(self) -> None:
+        """Begin anew with the next scan: everything is forgotten, but no object's number is given again."""
 
 
 def estimate_flow(pair: ScanPair, config: Config | None = None) -> FlowResult:
@@ -48,9 +61,15 @@ class FlowEstimator:
 
     def __init__(self, config: Config | None = None):
         self.config = config or Config()
+        self.tracks = Tracks()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew with the next scan; numbers of objects go on."""
         self._odometry = ego.Odometry(self.config)
         self._scan: Scan | None = None
         self._previous: Previous | None = None
+        self.tracks = Tracks(next_id=self.tracks.next_id)
 
     def step(self, scan: Scan) -> FlowResult | None:
         """Flow from the last scan to this one; None for the first."""
@@ -64,9 +83,15 @@ class FlowEstimator:
         # Forgotten first: after a scan that cannot be used, the next pair must not inherit an older one's.
         previous, self._previous = self._previous, None
         prepared = prepare(ScanPair(source, scan), self.config, previous, guess, timed)
-        result, tracks = explain(prepared, self.config, previous.tracks if previous else Tracks())
-        self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh, tracks)
+        tracks = self.tracks if previous else Tracks(next_id=self.tracks.next_id)
+        result, self.tracks = explain(prepared, self.config, tracks)
+        self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh)
         return result
+
+    def follow(self, scan: Scan, known: FlowResult, tracks: Tracks) -> None:
+        """Take `known` for the flow from the last scan to this one; only KISS-ICP sees the scan again."""
+        self._odometry.step(scan.points)
+        self._previous, self._scan, self.tracks = Previous(self._scan.points, known), scan, tracks
 
 
 def run(
@@ -110,13 +135,14 @@ def prepare(
         preparation.require_points(scan, config.preparation)
     points = pair.source.points
     with timed("features"):
-        source = previous.target if previous else features.extract(pair.source, config)
+        known = previous is not None and previous.target is not None
+        source = previous.target if known else features.extract(pair.source, config)
         target = features.extract(pair.target, config)
     with timed("ego-motion"):
         ego_motion = ego.find(
             points[source.usable], pair.target.points[target.usable], ego_guess, config.ego)
     with timed("mesh"):
-        source_mesh = previous.target_mesh if previous else _mesh(pair.source, source, config)
+        source_mesh = previous.target_mesh if known else _mesh(pair.source, source, config)
         target_mesh = _mesh(pair.target, target, config)
     with timed("matching"):
         start_motions = _start(points, previous, ego_motion, config)

@@ -206,7 +206,7 @@ def test_a_foreign_out_folder_is_left_alone_before_any_work(lidarflow, folder, t
     def no_work(*args):
         raise AssertionError("work was done for results that have no place")
 
-    monkeypatch.setattr("lidarflow.pipeline.run", no_work)
+    monkeypatch.setattr("lidarflow.runner.steps", no_work)
     monkeypatch.setattr("lidarflow.pipeline.estimate_flow", no_work)
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "text.tex").write_text("years of work")
