@@ -7,13 +7,14 @@ to the pair's points by a digest. It is written aside like all results and holds
 import hashlib
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
 from lidarflow import io, pose
+from lidarflow.checks import check
 from lidarflow.errors import DataError
 from lidarflow.lidar.tracking import Track, Tracks
 from lidarflow.types import FlowResult, MovingObject, Scan, ScanPair, SolveStats
@@ -43,7 +44,7 @@ class Checkpoints:
 
     def put(self, index: int, content: bytes) -> None:
         """Keep what `packed` made of the pair at `index`."""
-        with io.written_aside(self._file(index)) as aside:
+        with io.written_aside(self.file(index)) as aside:
             aside.write_bytes(content)
 
     def load(self, index: int, pair: ScanPair) -> tuple[FlowResult, Tracks]:
@@ -51,13 +52,14 @@ class Checkpoints:
 
         Raises DataError where the file is damaged, or was made of other points than the pair's.
         """
-        return unpacked(self._file(index), pair)
+        return unpacked(self.file(index), pair)
 
     def remove(self) -> None:
         """Let go of all of them: the run is complete, or begins anew."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _file(self, index: int) -> Path:
+    def file(self, index: int) -> Path:
+        """Where the checkpoint of the pair at `index` is."""
         return self.folder / f"{index:06d}.npz"
 
 
@@ -93,6 +95,8 @@ def unpacked(file: Path, pair: ScanPair) -> tuple[FlowResult, Tracks]:
                         f"{pair.target.name} now; the data changed, run again without --resume")
     try:
         notes = json.loads(str(arrays["notes"]))
+        check("motion_row", arrays["motion_row"], (len(pair.source),), "i")
+        check("motion_table", arrays["motion_table"], (None, 4, 4), "f")
         motions = arrays["motion_table"][arrays["motion_row"]]
         result = FlowResult(
             flow=arrays["flow"] if len(arrays["flow"]) else pose.apply(motions, pair.source.points)
@@ -100,9 +104,47 @@ def unpacked(file: Path, pair: ScanPair) -> tuple[FlowResult, Tracks]:
             motions=motions, stats=SolveStats(**notes["stats"]), seconds=notes["seconds"],
             objects=_objects(arrays), **{name: arrays[name] for name in _PLAIN})
         return result, Tracks(_tracks(arrays), notes["next_id"])
-    except (ValueError, KeyError, TypeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{file}: damaged ({reason}); delete it and resume again") from None
+
+
+@dataclass(slots=True)
+class Numbers:
+    """Numbers of objects in a whole run for those in a part of it: known ones, else the next that is free."""
+
+    known: dict[int, int]
+    next_id: int
+
+    def of(self, number: int) -> int:
+        """The whole run's number of what the part calls `number`."""
+        if number not in self.known:
+            self.known[number], self.next_id = self.next_id, self.next_id + 1
+        return self.known[number]
+
+
+def numbers_of(file: Path) -> np.ndarray:
+    """The number (N,) of the moving object that each point of a checkpoint is on, -1 = none."""
+    return io.read_archive(file, ("object_id",))["object_id"]
+
+
+def renumbered(file: Path, numbers: Numbers) -> bytes:
+    """A checkpoint as `packed` makes it, with other numbers of objects; tracks without one are let go."""
+    arrays = io.read_archive(file, _NAMES)
+    arrays["object_ids"] = np.array([numbers.of(old) for old in arrays["object_ids"].tolist()], np.int64)
+    old, row = np.unique(arrays["object_id"], return_inverse=True)
+    new = [numbers.of(number) if number >= 0 else -1 for number in old.tolist()]
+    arrays["object_id"] = np.array(new, np.int32)[row.reshape(-1)]
+    is_known = np.isin(arrays["track_ids"], list(numbers.known))
+    arrays["track_points"] = arrays["track_points"][np.repeat(is_known, arrays["track_counts"])]
+    for name in ("track_ids", "track_missed", "track_over_ground", "track_counts"):
+        arrays[name] = arrays[name][is_known]
+    arrays["track_ids"] = np.array([numbers.of(old) for old in arrays["track_ids"].tolist()], np.int64)
+    notes = json.loads(str(arrays["notes"]))
+    arrays["notes"] = np.array(json.dumps({**notes, "next_id": numbers.next_id}))
+    content = BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()
 
 
 def _distinct(motions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

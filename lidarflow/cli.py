@@ -13,7 +13,7 @@ import typer
 from lidarflow import __version__
 from lidarflow.errors import LidarflowError
 from lidarflow.rgbd_cli import app as rgbd_app
-from lidarflow.run_cli import pairs_done, process
+from lidarflow.run_cli import Spread, pairs_done, process
 from lidarflow.terminal import check_live_view as _check_live_view
 from lidarflow.terminal import show as _print
 from lidarflow.terminal import working as _working
@@ -142,6 +142,12 @@ def run(
         "--resume", help="Go on with a run that was interrupted; the results are the same.")] = False,
     skip_bad: Annotated[bool, typer.Option(
         "--skip-bad", help="Leave out scans that cannot be used, and say which.")] = False,
+    workers: Annotated[int | None, typer.Option(
+        min=1, help="So many processes, one core each (needs Dask distributed).")] = None,
+    scheduler: Annotated[str | None, typer.Option(
+        metavar="ADDRESS", help="The workers of a Dask scheduler, e.g. tcp://HOST:8786.")] = None,
+    chunk: Annotated[int | None, typer.Option(
+        min=1, help="Pairs that a worker computes in one go; 20 if not given.")] = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
 ) -> None:
@@ -155,7 +161,7 @@ def run(
     dataset = _open(data, dataloader, sequence, settings)
     print(f"method     {method}")
     process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans, method,
-             Going(resume, skip_bad))
+             Going(resume, skip_bad), Spread.wanted(workers, scheduler, chunk))
 
 
 @app.command()

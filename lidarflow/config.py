@@ -17,6 +17,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+_TOO_LARGE = 2**63
 Settings = TypeVar("Settings")   # a frozen dataclass whose fields are sections, such as Config or RgbdConfig
 
 
@@ -262,7 +263,7 @@ def read_toml(file: Path, what: str = "settings") -> dict:
         raise ConfigError(f"{file}: no such {what} file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read ({error})") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{file}: not valid TOML ({error})") from None
 
 
@@ -273,7 +274,7 @@ def _parse_override(override: str) -> dict:
         raise ConfigError(f"--set {override}: expected section.name=value, e.g. mesh.max_edge_m=0.5")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         value = text.strip()
     return {section: {name: value}}
 
@@ -285,6 +286,8 @@ def _check(section_config: Any, section: str, name: str, value: Any, origin: str
         raise ConfigError(f"{origin}: unknown setting '{section}.{name}'{_nearest(name, known)}")
     kind, meta = get_type_hints(type(section_config))[name], known[name].metadata
     key = f"{origin}: {section}.{name}"
+    if isinstance(value, int) and abs(value) >= _TOO_LARGE:
+        raise ConfigError(f"{key}: the number is too large")
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):

@@ -9,9 +9,7 @@ import json
 import os
 import re
 import shutil
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from io import StringIO
@@ -23,6 +21,7 @@ import tomli_w
 
 from lidarflow import pose
 from lidarflow.config import Config, to_dict
+from lidarflow.datasets import arrays
 from lidarflow.errors import DataError
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.types import FlowResult, SolveStats
@@ -146,7 +145,7 @@ def load_flow(path: Path) -> FlowFile:
     try:
         config, stats = json.loads(str(arrays["config"])), json.loads(str(arrays["stats"]))
         motions = _motions_of_rows(arrays["motion"])
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: damaged flow file ({_one_line(error)})") from None
     ego_motion = arrays["ego_motion"].astype(np.float64)
     if not pose.is_rigid(ego_motion, 1e-4) or not isinstance(config, dict) or not isinstance(stats, dict):
@@ -322,14 +321,11 @@ def read_archive(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise DataError(f"{path}: not an .npz archive, or a truncated one; expected a flow file")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [name for name in names if name not in archive.files]
-            if missing:
-                raise DataError(f"{path}: not a flow file, lacks {', '.join(missing)}; "
-                                "expected the output of 'lidarflow pair' or 'lidarflow run'")
-            return {name: np.asarray(archive[name]) for name in names}
-    except (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError, SyntaxError,
-            tokenize.TokenError, zipfile.BadZipFile, zlib.error) as error:
+        return arrays.from_npz(path, names)
+    except arrays.MissingArray as error:
+        raise DataError(f"{path}: not a flow file, {error}; expected the output of 'lidarflow pair' or "
+                        "'lidarflow run'") from None
+    except arrays.ERRORS as error:
         raise DataError(f"{path}: not a readable flow file ({_one_line(error)})") from None
 
 

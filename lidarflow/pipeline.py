@@ -42,8 +42,11 @@ class Estimator(Protocol):
     def step(self, scan: Scan) -> FlowResult | None:
         """Flow from the last scan to this one; None for the first. DataError for a scan of no use."""
 
-    def follow(self, scan: Scan, known: FlowResult, tracks: Tracks) -> None:
-        """As `step` where its answer and the tracks after it are known: the next step is the same."""
+    def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
+        """As `step` where its answer and the tracks after it are known: the next step is the same.
+
+        Where nothing is known (None), at least the odometry has seen the scan.
+        """
 
     def reset(self) -> None:
         """Begin anew with the next scan: everything is forgotten, but no object's number is given again."""
@@ -88,10 +91,11 @@ class FlowEstimator:
         self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh)
         return result
 
-    def follow(self, scan: Scan, known: FlowResult, tracks: Tracks) -> None:
+    def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
         """Take `known` for the flow from the last scan to this one; only KISS-ICP sees the scan again."""
         self._odometry.step(scan.points)
-        self._previous, self._scan, self.tracks = Previous(self._scan.points, known), scan, tracks
+        self._previous = None if known is None else Previous(self._scan.points, known)
+        self._scan, self.tracks = scan, tracks
 
 
 def run(

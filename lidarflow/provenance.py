@@ -52,10 +52,12 @@ def read(run_dir: Path) -> RunSource:
         texts = values["data"], values["loader"], values["kitti_correction"]
         if not all(isinstance(text, str) for text in texts):
             raise ValueError("data, loader and kitti_correction must be texts")
+        if not isinstance(values["sequence"], str | None):
+            raise ValueError("sequence must be a text or null")
         return RunSource(Source(Path(values["data"]), values["loader"], values["sequence"],
                                 values["kitti_correction"]), scans, skipped)
     except FileNotFoundError:
         raise DataError(f"{run_dir}: no {io.SOURCE_FILE}, which says what a run was made of; "
                         "expected a folder that 'lidarflow run' wrote") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"{file}: damaged ({type(error).__name__}: {error}); run again") from None

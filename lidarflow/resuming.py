@@ -52,7 +52,7 @@ def state_of(out: Path, plan: Plan) -> State:
     Raises DataError where `out` holds another run: of other data, other settings, another method, or in other
     chunks.
     """
-    begun = any((out / io.RESUME_FOLDER).glob("*.npz"))
+    begun = any((out / io.RESUME_FOLDER).rglob("*.npz"))
     if not begun and not (out / _LAST_FILE).is_file():
         return State.NEW
     if not (out / io.CONFIG_FILE).is_file():

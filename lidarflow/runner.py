@@ -137,6 +137,16 @@ def process(
     return reports
 
 
+def begin(dataset: Dataset, frames: list[int], config: Config, out: Path, method: str, going: Going
+          ) -> Checkpoints:
+    """Make `out` ready for checkpoints that others compute; those of an interrupted run stay."""
+    io.check_run_folder(out)
+    plan = Plan(RunSource(dataset.source, tuple(frames)), config, method, going.chunk)
+    if not (going.resume and state_of(out, plan) is State.BEGUN):
+        resuming.begin(out, plan)
+    return Checkpoints(out)
+
+
 def is_complete(dataset: Dataset, frames: list[int], config: Config, out: Path, method: str,
                 going: Going) -> bool:
     """Whether `out` holds all that `process` would write; DataError where it holds another run."""

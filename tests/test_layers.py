@@ -21,7 +21,7 @@ LAYERS = [
     {"metrics", "rgbd_metrics", "io", "viewer", "preview", "rgbd_preview"},
     {"provenance", "rgbd_io", "checkpoints", "trajectory"},
     {"rgbd_viewer", "resuming", "stepping"},
-    {"runner"},
+    {"runner", "cluster"},
     {"rgbd_runner"},
     {"evaluation", "compare"},
     {"tables", "score_tables", "rgbd_tables", "demo", "terminal"},

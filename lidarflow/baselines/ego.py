@@ -38,7 +38,7 @@ class Ego(WholeScan):
             self._guess = self._odometry.step(scan.points)
         return super().step(scan)
 
-    def follow(self, scan: Scan, known: FlowResult, tracks: Tracks) -> None:
+    def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
         """Take the flow to this scan for known; KISS-ICP sees the scan again."""
         self._odometry.step(scan.points)
         super().follow(scan, known, tracks)

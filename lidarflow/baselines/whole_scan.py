@@ -77,7 +77,7 @@ class WholeScan(ABC):
         self._previous = scan, prepared
         return result
 
-    def follow(self, scan: Scan, known: FlowResult, tracks: Tracks) -> None:
+    def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
         """Take the flow to this scan for known; what is needed of the scan is prepared when it is."""
         self._previous = scan, None
 

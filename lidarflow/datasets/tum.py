@@ -62,6 +62,7 @@ def read_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
     table = tables.read_numbers(path, 8)
     if len(table) and np.linalg.norm(table[:, 4:], axis=1).min() < 0.5:
         raise DataError(f"{path}: holds a quaternion that is not of unit length; expected qx qy qz qw")
+    tables.check_seconds(path, table[:, 0])
     table = table[np.argsort(table[:, 0], kind="stable")]
     return np.round(table[:, 0] * 1e9).astype(np.int64), pose.from_translation_quaternion(table[:, 1:])
 

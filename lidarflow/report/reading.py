@@ -104,7 +104,7 @@ def read_figures(run_dir: Path) -> dict:
             "bucketed": rebuilt(metrics.Bucketed | None, found.get("bucketed"), "bucketed"),
             "by_range": rebuilt(tuple[metrics.Interval, ...], found.get("by_range", []), "by_range"),
             "by_speed": rebuilt(tuple[metrics.Interval, ...], found.get("by_speed", []), "by_speed")}
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{file}: damaged, or of another version ({type(error).__name__}: {error}); "
                         f"write it anew with 'lidarflow eval {run_dir}', or run again") from None
 
