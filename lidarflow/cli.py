@@ -337,7 +337,7 @@ def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None
     with contextlib.ExitStack() as stack:
         aside = None if recording is None else stack.enter_context(io.written_aside(recording))
         stream = viewer.open_recording(aside, spawn=visualize)
-        stack.callback(viewer.close, stream)
+        stack.callback(viewer.close, stream, aside)
         viewer.log_pair(stream, 0, scans, result, (alignment.before, alignment.after), np.eye(4), arrows)
 
 
@@ -353,7 +353,7 @@ def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
     with io.written_aside(recording) as aside:
         stream = viewer.open_recording(aside)
         viewer.log_flow(stream, found.points, found.flow, found.is_dynamic, found.ego_motion, 0.1, points)
-        viewer.close(stream)
+        viewer.close(stream, aside)
 
 
 def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:
@@ -366,4 +366,4 @@ def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:
     with io.written_aside(recording) as aside:
         stream = rgbd_viewer.open_recording(aside)
         rgbd_viewer.log_file(stream, found)
-        viewer.close(stream)
+        viewer.close(stream, aside)

@@ -325,5 +325,5 @@ def recording(path: Path, viewing: Viewing, open_recording: Callable):
     with contextlib.ExitStack() as stack:
         aside = stack.enter_context(io.written_aside(path)) if viewing.record else None
         stream = open_recording(aside, viewing.visualize)
-        stack.callback(viewer.close, stream)
+        stack.callback(viewer.close, stream, aside)
         yield stream

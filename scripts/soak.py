@@ -1,6 +1,6 @@
 """Process the same scans again and again: memory, threads and open files must not grow, results not change.
 
-    python scripts/soak.py FOLDER [--rounds 10] [--scans N] [--method ours] [--solver fast]
+    python scripts/soak.py FOLDER [--rounds 10] [--scans N] [--solver fast] [--record]
 
 FOLDER is any data set, e.g. the 52 range images of moosmann_durlacher_tor. Every round is a run as
 `lidarflow run` makes it, all in one process. Prints a row a round and says in the end whether the rounds were
@@ -56,10 +56,10 @@ def system_threads():
     return len(list(tasks.iterdir())) if tasks.exists() else threading.active_count()
 
 
-def round_of(dataset, frames, settings, method, folder):
+def round_of(dataset, frames, settings, method, record, folder):
     """(seconds, resident MiB, threads, open files, hash) of one run."""
     begin = time.perf_counter()
-    runner.process(dataset, frames, settings, folder, runner.Viewing(), method=method)
+    runner.process(dataset, frames, settings, folder, runner.Viewing(record=record), method=method)
     spent_s = time.perf_counter() - begin
     return spent_s, resident_mib(), system_threads(), open_files(), digest(folder)
 
@@ -85,6 +85,8 @@ def main():
     parser.add_argument("--scans", type=int)
     parser.add_argument("--method", default="ours")
     parser.add_argument("--solver", default="gtsam")
+    parser.add_argument("--record", action="store_true",
+                        help="record too; rerun 0.41 keeps some threads of every recording")
     options = parser.parse_args()
     settings = load(overrides=(f"solver.method={options.solver}",))
     dataset = open_dataset(options.folder)
@@ -94,7 +96,8 @@ def main():
     rounds = []
     for number in range(options.rounds):
         with tempfile.TemporaryDirectory() as folder:
-            rounds.append(round_of(dataset, frames, settings, options.method, Path(folder) / "run"))
+            rounds.append(round_of(
+                dataset, frames, settings, options.method, options.record, Path(folder) / "run"))
         spent_s, memory_mib, threads, files, found = rounds[-1]
         print(f"{number + 1:5}  {spent_s:7.1f}  {memory_mib:12.0f}  {threads:7}  {files:10}  {found[:16]}",
               flush=True)

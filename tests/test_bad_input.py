@@ -76,7 +76,8 @@ def test_a_damaged_scan_in_the_middle_keeps_what_was_done(lidarflow, folder, tmp
     truncate(folder / "000002.bin")
     said = lidarflow.complaint("run", folder, "--out", "out")
     assert "000002.bin" in said and "truncated" in said and "kept in out/flow" in said
-    assert sorted(os.listdir(tmp_path / "out")) == ["config.toml", "flow", "source.json"]
+    assert sorted(os.listdir(tmp_path / "out")) == [
+        ".resume", "config.toml", "flow", "source.json"]
     assert os.listdir(tmp_path / "out" / "flow") == ["000000.npz"]
     assert len(io.load_flow(tmp_path / "out" / "flow" / "000000.npz").flow) == len(drive()[0][0])
     assert "cut short" in lidarflow.complaint("view", "out")

@@ -289,6 +289,20 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_space(street,
         subprocess.run(["umount", "-l", str(disc)], check=False)
 
 
+def test_a_recording_that_does_not_fit_is_not_taken_for_one(street, tmp_path):
+    """Rerun only logs that it could not write; the command notices that the end is missing."""
+    disc = tmp_path / "disc"
+    small_disc(disc, 1)
+    try:
+        pair = sorted(street.iterdir())[:2]
+        done = program(("pair", *pair, "--out", tmp_path / "flow.npz", "--recording", disc / "flow.rrd"))
+        assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+        assert "the end of the recording is missing" in done.stderr or "No space left" in done.stderr
+        assert os.listdir(disc) == [] and not (tmp_path / "flow.npz").exists()
+    finally:
+        subprocess.run(["umount", "-l", str(disc)], check=False)
+
+
 def test_files_that_may_not_grow_are_one_line(street, tmp_path, monkeypatch, lidarflow):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
