@@ -14,16 +14,15 @@ from lidarflow import __version__
 from lidarflow.errors import LidarflowError
 from lidarflow.export_cli import export
 from lidarflow.rgbd_cli import app as rgbd_app
+from lidarflow.run_cli import Spread, pairs_done, process
 from lidarflow.terminal import announce_first_use as _announce_first_use
 from lidarflow.terminal import check_live_view as _check_live_view
-from lidarflow.terminal import progress as _progress
 from lidarflow.terminal import show as _print
 from lidarflow.terminal import working as _working
 
 if TYPE_CHECKING:
     from lidarflow.config import Config
     from lidarflow.datasets import Dataset
-    from lidarflow.runner import Viewing
 
 _INTERRUPTED = 130     # what typer makes of Ctrl-C
 
@@ -142,19 +141,30 @@ def run(
     visualize: Visualize = False,
     arrows: Arrows = False,
     record: Annotated[bool, typer.Option(help="Write recording.rrd (about 5 MB a pair).")] = True,
+    resume: Annotated[bool, typer.Option(
+        "--resume", help="Go on with a run that was interrupted; the results are the same.")] = False,
+    skip_bad: Annotated[bool, typer.Option(
+        "--skip-bad", help="Leave out scans that cannot be used, and say which.")] = False,
+    workers: Annotated[int | None, typer.Option(
+        min=1, help="So many processes, one core each (needs Dask distributed).")] = None,
+    scheduler: Annotated[str | None, typer.Option(
+        metavar="ADDRESS", help="The workers of a Dask scheduler, e.g. tcp://HOST:8786.")] = None,
+    chunk: Annotated[int | None, typer.Option(
+        min=1, help="Pairs that a worker computes in one go; 20 if not given.")] = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
 ) -> None:
     """Flow between all consecutive scans of a data set."""
     from lidarflow import methods
     from lidarflow.config import load
-    from lidarflow.runner import Viewing
+    from lidarflow.runner import Going, Viewing
 
     settings = load(config, _with_solver(overrides, solver))
     methods.find(method)
     dataset = _open(data, dataloader, sequence, settings)
     print(f"method     {method}")
-    _process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans, method)
+    process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans, method,
+             Going(resume, skip_bad), Spread.wanted(workers, scheduler, chunk))
 
 
 @app.command()
@@ -181,7 +191,7 @@ def compare(
         io.check_output("--out", out, ".json", inputs=(data,))
     dataset = _open(data, dataloader, sequence, settings)
     frames = runner.choose_frames(dataset, jump, n_scans)
-    with _pairs_done(len(frames) - 1) as on_pair:
+    with pairs_done(len(frames) - 1) as on_pair:
         found = comparing.compare(dataset, frames, chosen, settings, on_pair)
     print()
     _print(tables.compare_table(found))
@@ -295,7 +305,7 @@ def demo(
     settings = load(overrides=("preparation.kitti_correction=off",))
     dataset = open_dataset(folder, kitti_correction=settings.preparation.kitti_correction)
     print(f"generated  {folder}: {len(dataset)} scans with truth, in KITTI's layout")
-    _process(dataset, settings, out / generated.RUN_FOLDER, Viewing(visualize=visualize), 0, None)
+    process(dataset, settings, out / generated.RUN_FOLDER, Viewing(visualize=visualize), 0, None)
 
 
 @app.command(name="config")
@@ -324,40 +334,6 @@ def _open(data: Path, dataloader: str | None, sequence: str | None, settings: "C
     return dataset
 
 
-@contextlib.contextmanager
-def _pairs_done(pairs: int):
-    """A bar on standard error; yields what to call with the name of every finished pair."""
-    _announce_first_use()
-    with _progress("scan pairs", pairs) as progress:
-        yield lambda frame: progress.update(0, advance=1, description=f"scan pairs, {frame} done")
-
-
-def _process(
-    dataset: "Dataset", settings: "Config", out: Path, viewing: "Viewing", jump: int, n_scans: int | None,
-    method: str = "ours",
-) -> None:
-    from lidarflow import runner
-    from lidarflow.tables import run_notes, run_table
-
-    _check_live_view(viewing.visualize)
-    frames = runner.choose_frames(dataset, jump, n_scans)
-    with _pairs_done(len(frames) - 1) as on_pair:
-        reports = runner.process(
-            dataset, frames, settings, out, viewing, lambda report: on_pair(report.frame), method)
-    print()
-    _print(run_table(reports, settings))
-    print()
-    for note in run_notes(reports, settings):
-        print(note)
-    print()
-    print(f"results    {out}")
-    print(f"metrics    {out / 'metrics.json'}")
-    print(f"picture    {out / 'preview.png'}   (the last pair)")
-    if viewing.record:
-        print(f"recording  {out / 'recording.rrd'}")
-        print(f"look at it with: lidarflow view {out}")
-
-
 def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None:
     """Log one pair to a file, the live viewer, or both."""
     import numpy as np
@@ -367,7 +343,7 @@ def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None
     with contextlib.ExitStack() as stack:
         aside = None if recording is None else stack.enter_context(io.written_aside(recording))
         stream = viewer.open_recording(aside, spawn=visualize)
-        stack.callback(viewer.close, stream)
+        stack.callback(viewer.close, stream, aside)
         viewer.log_pair(stream, 0, scans, result, (alignment.before, alignment.after), np.eye(4), arrows)
 
 
@@ -383,7 +359,7 @@ def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
     with io.written_aside(recording) as aside:
         stream = viewer.open_recording(aside)
         viewer.log_flow(stream, found.points, found.flow, found.is_dynamic, found.ego_motion, 0.1, points)
-        viewer.close(stream)
+        viewer.close(stream, aside)
 
 
 def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:
@@ -396,4 +372,4 @@ def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:
     with io.written_aside(recording) as aside:
         stream = rgbd_viewer.open_recording(aside)
         rgbd_viewer.log_file(stream, found)
-        viewer.close(stream)
+        viewer.close(stream, aside)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # A frozen dataclass whose fields are sections, such as Config or RgbdConfig.
 Settings = TypeVar("Settings", bound="DataclassInstance")
+_TOO_LARGE = 2**63
 
 
 def setting(default: Any, effect: str, *, low: float | None = None, high: float | None = None,
@@ -273,7 +274,7 @@ def read_toml(file: Path, what: str = "settings") -> dict:
         raise ConfigError(f"{file}: no such {what} file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read ({error})") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{file}: not valid TOML ({error})") from None
 
 
@@ -284,7 +285,7 @@ def _parse_override(override: str) -> dict:
         raise ConfigError(f"--set {override}: expected section.name=value, e.g. mesh.max_edge_m=0.5")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         value = text.strip()
     return {section: {name: value}}
 
@@ -296,6 +297,8 @@ def _check(section_config: Any, section: str, name: str, value: Any, origin: str
         raise ConfigError(f"{origin}: unknown setting '{section}.{name}'{_nearest(name, known)}")
     kind, meta = get_type_hints(type(section_config))[name], known[name].metadata
     key = f"{origin}: {section}.{name}"
+    if isinstance(value, int) and abs(value) >= _TOO_LARGE:
+        raise ConfigError(f"{key}: the number is too large")
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):

@@ -1,8 +1,15 @@
 """Errors a user can act on: what was found, what was expected, what to do."""
 
 
+_MOST_CHARS = 2000     # what damaged files are quoted with has no other end
+
+
 class LidarflowError(Exception):
     """Any problem with data or settings; the command line shows it as one line and exits with 1."""
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        return text if len(text) <= _MOST_CHARS else f"{text[:_MOST_CHARS // 2]} … {text[-_MOST_CHARS // 2:]}"
 
 
 class ConfigError(LidarflowError):

@@ -1,6 +1,5 @@
 """Scores of results on disk: a run folder or a flow file, against its data set's truth or a given one."""
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from lidarflow.datasets import Dataset, Source
 from lidarflow.datasets.base import read_truth
 from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.errors import DataError
+from lidarflow.provenance import RunSource
 from lidarflow.runner import PairReport
 from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
@@ -58,13 +58,13 @@ def evaluate_run(run_dir: Path, truth: Path | None = None, data: Path | None = N
         raise DataError(f"{run_dir}: no flow files in {io.FLOW_FOLDER}; was the run cut short? run it again")
     dataset = _opened(source.dataset, data, needed=truth is None, run_dir=run_dir)
     if dataset is None:
-        if len(files) != len(source.scans) - 1:
-            raise DataError(f"{run_dir}: {len(files)} flow files for {len(source.scans) - 1} pairs; "
+        if len(files) != len(source.pairs):
+            raise DataError(f"{run_dir}: {len(files)} flow files for {len(source.pairs)} pairs; "
                             "was the run cut short? run it again")
         reports = [_from_files(file, following, truth, len(files), config)
                    for file, following in zip(files, [*files[1:], None], strict=True)]
     else:
-        reports = list(_from_dataset(run_dir, files, dataset, source.scans, truth, config))
+        reports = list(_from_dataset(run_dir, files, dataset, source, truth, config))
     place = str(truth) if truth is not None else str(dataset.source.folder)
     _check_truths(place, reports)
     return Evaluation(reports, config, place)
@@ -95,7 +95,7 @@ def known_pairs(run_dir: Path, numbers: Sequence[int]) -> Iterator[tuple[ScanPai
     dataset = _opened(source.dataset, None, needed=True, run_dir=run_dir)
     _check_length(dataset, source.scans, run_dir)
     for number in numbers:
-        index, following = source.scans[number], source.scans[number + 1]
+        index, following = source.pairs[number]
         pair = ScanPair(dataset.scan(index), dataset.scan(following))
         file = run_dir / io.FLOW_FOLDER / f"{pair.source.name}.npz"
         _check_points(file, io.load_flow(file).points, pair.source, dataset)
@@ -113,25 +113,25 @@ def _opened(source: Source | None, data: Path | None, needed: bool, run_dir: Pat
 
 
 def _from_dataset(
-    run_dir: Path, files: list[Path], dataset: Dataset, scans: tuple[int, ...], truth: Path | None,
-    config: Config,
+    run_dir: Path, files: list[Path], dataset: Dataset, run: RunSource, truth: Path | None, config: Config,
 ) -> Iterator[PairReport]:
     """A report for every pair that the run went through, scans read once each."""
-    _check_length(dataset, scans, run_dir)
+    _check_length(dataset, run.scans, run_dir)
     left = {file.stem: file for file in files}
-    target = dataset.scan(scans[0])
-    for index, following in itertools.pairwise(scans):
-        source, target = target, dataset.scan(following)
+    last, target = None, None
+    for index, following in run.pairs:
+        source, target = target if index == last else dataset.scan(index), dataset.scan(following)
+        last = following
         file = left.pop(source.name, None)
         if file is None:
             raise DataError(f"{run_dir}: no flow of scan {source.name} ({len(files)} flow files for "
-                            f"{len(scans) - 1} pairs); was the run cut short? run it again")
+                            f"{len(run.pairs)} pairs); was the run cut short? run it again")
         points, result = _read(file)
         _check_points(file, points, source, dataset)
         if truth is None:
             known, origin = runner.find_truth(dataset, index, ScanPair(source, target))
         else:
-            known = _given_truth(truth, source.name, len(source), len(scans) - 1)
+            known = _given_truth(truth, source.name, len(source), len(run.pairs))
             origin = known.origin
         alignment = metrics.alignment(source, target, result, config.crispness.sigma_m)
         yield runner.report_result(source, result, None, alignment, known, origin)

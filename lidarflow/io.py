@@ -7,9 +7,9 @@ import contextlib
 import csv
 import json
 import os
-import tokenize
+import re
+import shutil
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from io import StringIO
@@ -21,6 +21,7 @@ import tomli_w
 
 from lidarflow import pose
 from lidarflow.config import Config, to_dict
+from lidarflow.datasets import arrays
 from lidarflow.errors import DataError
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.types import FlowResult, SolveStats
@@ -35,6 +36,7 @@ RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", METRICS_FILE, "timing.json",
                 RECORDING_FILE, "preview.png")
 OBJECT_COLUMNS = ("frame", "id", "points", "x", "y", "z", "length", "width", "height", "yaw",
                   "vx", "vy", "vz", "speed_m_per_s")
+RESUME_FOLDER = ".resume"      # what a run keeps until it is complete
 LATEST = "latest"
 
 # name: (shape, after N for the arrays with a row per point; dtype kind)
@@ -143,7 +145,7 @@ def load_flow(path: Path) -> FlowFile:
     try:
         config, stats = json.loads(str(arrays["config"])), json.loads(str(arrays["stats"]))
         motions = _motions_of_rows(arrays["motion"])
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: damaged flow file ({_one_line(error)})") from None
     ego_motion = arrays["ego_motion"].astype(np.float64)
     if not pose.is_rigid(ego_motion, 1e-4) or not isinstance(config, dict) or not isinstance(stats, dict):
@@ -185,8 +187,13 @@ def write_json(path: Path, data: Any) -> None:
 
 def write_toml(path: Path, config: Config | RgbdConfig, comment: str = "") -> None:
     """Write every setting, below a `comment`, in a form that can be read back as a settings file."""
+    write_text(path, as_toml(config, comment))
+
+
+def as_toml(config: Config | RgbdConfig, comment: str = "") -> str:
+    """Every setting as TOML, below a `comment`."""
     heading = f"# {comment}\n\n" if comment else ""
-    write_text(path, heading + tomli_w.dumps(to_dict(config)))
+    return heading + tomli_w.dumps(to_dict(config))
 
 
 def check_output(option: str, path: Path, suffix: str, inputs: tuple[Path, ...] = ()) -> None:
@@ -238,11 +245,27 @@ def new_run_folder(out: Path) -> Path:
     check_run_folder(out)
     try:
         (out / FLOW_FOLDER).mkdir(parents=True, exist_ok=True)
+        # What a run could be resumed from goes first, so that no moment leaves it with another run's files.
+        shutil.rmtree(out / RESUME_FOLDER, ignore_errors=True)
         for old in [*(out / FLOW_FOLDER).glob("*.npz"), *(out / name for name in RESULT_FILES)]:
             old.unlink(missing_ok=True)
+        remove_left_overs(out)
     except OSError as error:
         raise DataError(f"cannot write {out}: {error.strerror or error}; choose another --out") from error
     return out
+
+
+def remove_left_overs(out: Path) -> None:
+    """Remove what a killed run left half-written in its folder `out`."""
+    for folder in (out, out / FLOW_FOLDER, out / RESUME_FOLDER):
+        for left in folder.glob(".*.part"):
+            if is_left_over(left.name):
+                left.unlink(missing_ok=True)
+
+
+def is_left_over(name: str) -> bool:
+    """Whether a file of this name is one that `written_aside` had not finished."""
+    return re.fullmatch(r"\..+\.\d+\.part", name) is not None
 
 
 def link_latest(run_dir: Path) -> Path | None:
@@ -286,7 +309,8 @@ def _check_parents(option: str, path: Path) -> None:
 
 def _is_run(names: set[str]) -> bool:
     """Whether a folder with these entries is an earlier run, finished or cut short."""
-    return FLOW_FOLDER in names and (CONFIG_FILE in names or names == {FLOW_FOLDER})
+    names = {name for name in names if not is_left_over(name)}
+    return FLOW_FOLDER in names and (CONFIG_FILE in names or names <= {FLOW_FOLDER, SOURCE_FILE})
 
 
 def read_archive(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -297,14 +321,11 @@ def read_archive(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise DataError(f"{path}: not an .npz archive, or a truncated one; expected a flow file")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [name for name in names if name not in archive.files]
-            if missing:
-                raise DataError(f"{path}: not a flow file, lacks {', '.join(missing)}; "
-                                "expected the output of 'lidarflow pair' or 'lidarflow run'")
-            return {name: np.asarray(archive[name]) for name in names}
-    except (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError, SyntaxError,
-            tokenize.TokenError, zipfile.BadZipFile, zlib.error) as error:
+        return arrays.from_npz(path, names)
+    except arrays.MissingArray as error:
+        raise DataError(f"{path}: not a flow file, {error}; expected the output of 'lidarflow pair' or "
+                        "'lidarflow run'") from None
+    except arrays.ERRORS as error:
         raise DataError(f"{path}: not a readable flow file ({_one_line(error)})") from None
 
 

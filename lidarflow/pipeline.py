@@ -34,20 +34,36 @@ _MATCHED_NEAR_M = 1.5   # of the seeds of objects; a car's other end is farther,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Previous:
-    """What one pair leaves for the next: source points and result, its target's features and mesh, tracks."""
+    """What one pair leaves for the next: source points and result, its target's features and mesh.
+
+    Features and mesh are None where the result was known already; they are made again when they are needed.
+    """
 
     points: np.ndarray
     result: FlowResult
-    target: features.Features
-    target_mesh: Mesh
-    tracks: Tracks
+    target: features.Features | None = None
+    target_mesh: Mesh | None = None
 
 
 class Estimator(Protocol):
-    """A method that is shown the scans of a sequence one by one."""
+    """A method that is shown the scans of a sequence one by one.
+
+    tracks  the objects that are followed, and the first number that is still free
+    """
+
+    tracks: Tracks
 
     def step(self, scan: Scan) -> FlowResult | None:
         """Flow from the last scan to this one; None for the first. DataError for a scan of no use."""
+
+    def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
+        """As `step` where its answer and the tracks after it are known: the next step is the same.
+
+        Where nothing is known (None), at least the odometry has seen the scan.
+        """
+
+    def reset(self) -> None:
+        """Begin anew with the next scan: everything is forgotten, but no object's number is given again."""
 
 
 def estimate_flow(
@@ -70,9 +86,15 @@ class FlowEstimator:
 
     def __init__(self, config: Config | None = None):
         self.config = config or Config()
+        self.tracks = Tracks()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew with the next scan; numbers of objects go on."""
         self._odometry = ego.Odometry(self.config)
         self._scan: Scan | None = None
         self._previous: Previous | None = None
+        self.tracks = Tracks(next_id=self.tracks.next_id)
 
     def step(self, scan: Scan | np.ndarray) -> FlowResult | None:
         """Flow from the last scan to this one, a Scan or points (N, 3) in metres; None for the first.
@@ -90,10 +112,17 @@ class FlowEstimator:
             return None
         # Forgotten first: after a scan that cannot be used, the next pair must not inherit an older one's.
         previous, self._previous = self._previous, None
-        prepared = prepare(ScanPair(source, scan), self.config, previous, guess, timed)
-        result, tracks = explain(prepared, self.config)
-        self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh, tracks)
+        tracks = self.tracks if previous else Tracks(next_id=self.tracks.next_id)
+        prepared = prepare(ScanPair(source, scan), self.config, previous, guess, tracks, timed)
+        result, self.tracks = explain(prepared, self.config)
+        self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh)
         return result
+
+    def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
+        """Take `known` for the flow from the last scan to this one; only KISS-ICP sees the scan again."""
+        self._odometry.step(scan.points)
+        self._previous = None if known is None else Previous(self._scan.points, known)
+        self._scan, self.tracks = scan, tracks
 
 
 def run(
@@ -131,27 +160,28 @@ class Prepared:
 
 def prepare(
     pair: ScanPair, config: Config, previous: Previous | None = None, ego_guess: np.ndarray | None = None,
-    timed: Stopwatch | None = None,
+    tracks: Tracks | None = None, timed: Stopwatch | None = None,
 ) -> Prepared:
     """All of a pair that comes before objects and solver; raises DataError for scans that cannot be used.
 
-    `previous` is what the pair before left, `ego_guess` a start value (4, 4) for its ego-motion, `timed`
-    goes on measuring stages.
+    `previous` is what the pair before left, and `tracks` its objects'; `ego_guess` is a start value (4, 4) for
+    the ego-motion, `timed` goes on measuring stages.
     """
     timed = timed or Stopwatch()
     for scan in (pair.source, pair.target):
         preparation.require_points(scan, config.preparation)
     points = pair.source.points
     with timed("features"):
-        source = previous.target if previous else features.extract(pair.source, config)
+        known = previous is not None and previous.target is not None
+        source = previous.target if known else features.extract(pair.source, config)
         target = features.extract(pair.target, config)
     with timed("ego-motion"):
         ego_motion = ego.find(
             points[source.usable], pair.target.points[target.usable], ego_guess, config.ego)
     with timed("mesh"):
-        source_mesh = previous.target_mesh if previous else _mesh(pair.source, source, config)
+        source_mesh = previous.target_mesh if known else _mesh(pair.source, source, config)
         target_mesh = _mesh(pair.target, target, config)
-    tracks, search = previous.tracks if previous else Tracks(), None
+    tracks, search = tracks or Tracks(), None
     if config.objects.enabled:
         with timed("evidence"):
             search = attribution.search(source, target, ego_motion, tracks, config)

@@ -1,5 +1,6 @@
 """What a run was made of: kept in its folder, so that its data set can be opened again."""
 
+import itertools
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,20 @@ from lidarflow.errors import DataError
 
 @dataclass(frozen=True, slots=True)
 class RunSource:
-    """A data set, None where `open_dataset` did not open it, and the indices of the scans gone through."""
+    """A data set, None where `open_dataset` did not open it, and the indices of the scans gone through.
+
+    skipped  those among them that could not be used
+    """
 
     dataset: Source | None
     scans: tuple[int, ...]
+    skipped: tuple[int, ...] = ()
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Indices of source and target of every pair that there is a flow of."""
+        left_out = set(self.skipped)
+        return [pair for pair in itertools.pairwise(self.scans) if left_out.isdisjoint(pair)]
 
 
 def write(run_dir: Path, source: RunSource) -> None:
@@ -23,7 +34,8 @@ def write(run_dir: Path, source: RunSource) -> None:
     described = {} if opened is None else {
         "data": str(opened.folder), "loader": opened.loader, "sequence": opened.sequence,
         "kitti_correction": opened.kitti_correction}
-    io.write_json(run_dir / io.SOURCE_FILE, {**described, "scans": source.scans})
+    io.write_json(run_dir / io.SOURCE_FILE, {
+        **described, "scans": source.scans, **({"skipped": source.skipped} if source.skipped else {})})
 
 
 def read(run_dir: Path) -> RunSource:
@@ -34,17 +46,20 @@ def read(run_dir: Path) -> RunSource:
         scans = tuple(int(index) for index in values["scans"])
         if len(scans) < 2 or min(scans) < 0:
             raise ValueError("scans must be two indices or more")
+        skipped = tuple(int(index) for index in values.get("skipped", ()))
         if "data" not in values:
-            return RunSource(None, scans)
+            return RunSource(None, scans, skipped)
         texts = values["data"], values["loader"], values["kitti_correction"]
         if not all(isinstance(text, str) for text in texts):
             raise ValueError("data, loader and kitti_correction must be texts")
+        if not isinstance(values["sequence"], str | None):
+            raise ValueError("sequence must be a text or null")
         return RunSource(Source(Path(values["data"]), values["loader"], values["sequence"],
-                                values["kitti_correction"]), scans)
+                                values["kitti_correction"]), scans, skipped)
     except FileNotFoundError:
         raise DataError(f"{run_dir}: no {io.SOURCE_FILE}, which says what a run was made of; "
                         "expected a folder that 'lidarflow run' wrote") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"{file}: damaged ({type(error).__name__}: {error}); run again") from None
 
 

@@ -78,7 +78,7 @@ def load_flow(path: Path) -> RgbdFlowFile:
             raise ValueError("config and stats are no tables")
         if not pose.is_rigid(result.cluster_motions, 1e-4):
             raise ValueError("its cluster motions are not rigid")
-    except (ValueError, OverflowError) as error:
+    except (ValueError, OverflowError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{path}: damaged flow file ({reason})") from None
     return RgbdFlowFile(result, arrays["color"], found["config"], found["stats"])

@@ -1,18 +1,24 @@
 """A whole run: a data set in, a folder of results out."""
 
 import contextlib
+import itertools
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, methods, metrics, pipeline, pose, preview, provenance
+from lidarflow import io, methods, metrics, pose, preview, provenance, resuming
+from lidarflow.checkpoints import Checkpoints
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
-from lidarflow.errors import DataError, LidarflowError
+from lidarflow.errors import DataError
+from lidarflow.provenance import RunSource
+from lidarflow.resuming import Plan, State, state_of
+from lidarflow.stepping import Skipped, Step, saying_what_is_kept, steps
+from lidarflow.trajectory import Trajectory
 from lidarflow.types import FlowResult, Scan, ScanPair, SolveStats, Truth
 
 
@@ -66,51 +72,119 @@ def choose_frames(dataset: Dataset, jump: int, count: int | None, what: str = "s
     return frames
 
 
+@dataclass(frozen=True, slots=True)
+class Going:
+    """How a run goes on where not everything is as it should be.
+
+    resume    take over what an interrupted run of the same data, settings and method has done
+    skip_bad  leave out scans that cannot be used
+    chunk     pairs that were computed on their own by several processes, 0 = none
+    on_skip   hears of every scan that is left out
+    """
+
+    resume: bool = False
+    skip_bad: bool = False
+    chunk: int = 0
+    on_skip: Callable[[Skipped], None] = lambda skipped: None
+
+
 def process(
     dataset: Dataset, frames: list[int], config: Config, out: Path, viewing: Viewing,
     on_pair: Callable[[PairReport], None] = lambda report: None, method: str = methods.OURS,
+    going: Going | None = None,
 ) -> list[PairReport]:
     """Process `frames` of a data set and write a run folder; `on_pair` hears of every finished pair.
 
     `method` is one of methods.METHODS. Flow files are complete as soon as they appear; poses, objects,
-    metrics, recording and picture follow. Raises LidarflowError for input or output that cannot be used.
+    metrics, recording and picture follow. Until then every pair is kept as a checkpoint too, from which
+    `going.resume` goes on. Raises LidarflowError for input or output that cannot be used.
     """
+    going = going or Going()
+    skipped: list[Skipped] = []
     # The first pair is done before the folder is touched: a bad data set leaves no empty run behind.
     io.check_run_folder(out)
-    reports: list[PairReport] = []
-    estimator = methods.find(method).along(config)
-    results = _explained(pipeline.run(dataset, frames, estimator), dataset, frames, reports, out)
-    first = next(results)
-    io.new_run_folder(out)
-    io.write_toml(out / io.CONFIG_FILE, config, f"Method: {method}")
-    provenance.write(out, provenance.RunSource(dataset.source, tuple(frames)))
-    world_from_sensor, times_ns, objects = [np.eye(4)], [], []
+    plan = Plan(RunSource(dataset.source, tuple(frames)), config, method, going.chunk)
+    begun = going.resume and state_of(out, plan) is State.BEGUN
+    kept = Checkpoints(out)
+    done = saying_what_is_kept(
+        steps(dataset, frames, methods.find(method).along(config), kept if begun else None,
+              _heard(going, skipped) if going.skip_bad else None), out)
+    first = next(done, None)
+    if first is None:
+        raise DataError(f"{dataset.name}: no two neighbouring scans can be used; the first that cannot: "
+                        f"{skipped[0].reason}")
+    if begun:
+        io.remove_left_overs(out)
+    else:
+        resuming.begin(out, plan)
+    reports, way, objects = [], Trajectory(frames), []
     with recording(out / io.RECORDING_FILE, viewing, _open_recording) as stream:
-        for index, (pair, result) in zip(frames, _chained(first, results), strict=False):
-            begin = time.perf_counter()
-            io.save_flow(out / io.FLOW_FOLDER / f"{pair.source.name}.npz", pair.source.points, result, config)
-            report = report_pair(dataset, index, pair, result, config)
-            if stream is not None:
-                from lidarflow import viewer
-
-                score = (report.alignment.before, report.alignment.after)
-                viewer.log_pair(stream, index, pair, result, score, world_from_sensor[-1], viewing.arrows)
-            world_from_sensor.append(world_from_sensor[-1] @ pose.inverse(result.ego_motion))
-            times_ns.append(pair.source.time_ns)
-            objects += _object_rows(pair.source.name, result)
-            with_output = {**report.seconds, "scores and output": time.perf_counter() - begin}
-            reports.append(replace(report, seconds=with_output))
+        for step in itertools.chain([first], done):
+            reports.append(_write_pair(dataset, step, config, out, stream, way, viewing.arrows))
+            if not step.restored:
+                kept.save(step.index, step.pair, step.result, step.tracks)
+            objects += _object_rows(step.pair.source.name, step.result)
             on_pair(reports[-1])
-    poses = np.stack(world_from_sensor)
-    io.write_poses_kitti(out / "poses_kitti.txt", poses)
-    io.write_poses_tum(out / "poses_tum.txt", poses, [*times_ns, pair.target.time_ns])
+    way.write(out)
     io.write_objects(out / io.OBJECTS_FILE, objects)
     with io.written_aside(out / "preview.png") as aside:
-        preview.write_preview(aside, pair, result)
-    io.write_json(out / io.METRICS_FILE, metrics_of(reports, config))
+        preview.write_preview(aside, step.pair, step.result)
+    provenance.write(out, replace(plan.source, skipped=tuple(scan.index for scan in skipped)))
+    io.write_json(out / io.METRICS_FILE, {**metrics_of(reports, config), **_plain_skipped(skipped)})
     io.write_json(out / "timing.json", {r.frame: r.seconds for r in reports})
+    kept.remove()
     io.link_latest(out)
     return reports
+
+
+def begin(dataset: Dataset, frames: list[int], config: Config, out: Path, method: str, going: Going
+          ) -> Checkpoints:
+    """Make `out` ready for checkpoints that others compute; those of an interrupted run stay."""
+    io.check_run_folder(out)
+    plan = Plan(RunSource(dataset.source, tuple(frames)), config, method, going.chunk)
+    if not (going.resume and state_of(out, plan) is State.BEGUN):
+        resuming.begin(out, plan)
+    return Checkpoints(out)
+
+
+def is_complete(dataset: Dataset, frames: list[int], config: Config, out: Path, method: str,
+                going: Going) -> bool:
+    """Whether `out` holds all that `process` would write; DataError where it holds another run."""
+    plan = Plan(RunSource(dataset.source, tuple(frames)), config, method, going.chunk)
+    return state_of(out, plan) is State.COMPLETE
+
+
+def _write_pair(
+    dataset: Dataset, step: Step, config: Config, out: Path, stream, way: Trajectory, arrows: bool
+) -> PairReport:
+    """Write the flow file of a pair, log it, lengthen the way by it, and report it."""
+    begin, pair, result = time.perf_counter(), step.pair, step.result
+    file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
+    if not (step.restored and file.is_file()):     # a checkpoint is younger than its flow file
+        io.save_flow(file, pair.source.points, result, config)
+    report = report_pair(dataset, step.index, pair, result, config)
+    world_from_source = way.reached(step.index)
+    if stream is not None:
+        from lidarflow import viewer
+
+        score = (report.alignment.before, report.alignment.after)
+        viewer.log_pair(stream, step.index, pair, result, score, world_from_source, arrows)
+    way.add(step.index, pair, result.ego_motion)
+    return replace(report, seconds={
+        **report.seconds, "scores and output": time.perf_counter() - begin})
+
+
+def _heard(going: Going, skipped: list[Skipped]) -> Callable[[Skipped], None]:
+    """What takes down a scan that is left out, and says it."""
+    def on_skip(scan: Skipped) -> None:
+        skipped.append(scan)
+        going.on_skip(scan)
+
+    return on_skip
+
+
+def _plain_skipped(skipped: list[Skipped]) -> dict:
+    return {"skipped": [{"scan": scan.index, "reason": scan.reason} for scan in skipped]} if skipped else {}
 
 
 def metrics_of(reports: list[PairReport], config: Config) -> dict:
@@ -231,23 +305,6 @@ def _object_rows(frame: str, result: FlowResult) -> list[tuple]:
         for found in result.objects]
 
 
-def _chained(first, rest) -> Iterator[tuple[ScanPair, FlowResult]]:
-    yield first
-    yield from rest
-
-
-def _explained(
-    results: Iterator, dataset: Dataset, frames: list[int], reports: list[PairReport], out: Path
-) -> Iterator:
-    """`results`; an error on the way also says where in the data set it is, and what is kept of the run."""
-    try:
-        yield from results
-    except LidarflowError as error:
-        index = frames[len(reports)]
-        kept = f"; the flow of {len(reports)} before is kept in {out / io.FLOW_FOLDER}" if reports else ""
-        raise type(error)(f"{error} (scans {index} and {index + 1} of {dataset.name}{kept})") from error
-
-
 def _open_recording(path: Path | None, spawn: bool):
     from lidarflow import viewer
 
@@ -268,5 +325,5 @@ def recording(path: Path, viewing: Viewing, open_recording: Callable):
     with contextlib.ExitStack() as stack:
         aside = stack.enter_context(io.written_aside(path)) if viewing.record else None
         stream = open_recording(aside, viewing.visualize)
-        stack.callback(viewer.close, stream)
+        stack.callback(viewer.close, stream, aside)
         yield stream

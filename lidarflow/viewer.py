@@ -4,6 +4,7 @@ Entities: world/source holds the scan coloured by its motion over ground, world/
 moved scan laid over it, world/trajectory the way of the sensor, crispness the alignment before and after.
 """
 
+import errno
 import os
 import socket
 import subprocess
@@ -12,6 +13,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+
+# What rerun cannot write is seen by `close`, and said in one line.
+os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=off")
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -38,6 +42,8 @@ _ARROW_ABOVE_M = 0.4
 _WHEEL_PX = 420
 _SENSOR_OUTLINE = np.array([(1.2, 0, 0), (-0.8, 0.8, 0), (-0.4, 0, 0), (-0.8, -0.8, 0), (1.2, 0, 0)])
 _EARLIEST_DATE_NS = 10**17  # 1973: smaller times count from the start of the drive
+_FOOTER = b"RRF2FOOT"        # what a recording ends with
+_FOOTER_BYTES = 64
 _PORT = 9876
 _VIEWER_START_S = 20.0
 
@@ -67,10 +73,21 @@ def open_stream(path: Path | None, application_id: str, spawn: bool,
     return stream
 
 
-def close(stream: rr.RecordingStream) -> None:
-    """Write what is still buffered and end the recording."""
+def close(stream: rr.RecordingStream, path: Path | None = None) -> None:
+    """Write what is still buffered and end the recording; OSError where the file `path` lacks its end.
+
+    Rerun writes in threads of its own, which only log that a disk is full.
+    """
     stream.flush()
     stream.disconnect()
+    if path is not None and not _ends_well(Path(path)):
+        raise OSError(errno.EIO, "the end of the recording is missing, is the disk full?")
+
+
+def _ends_well(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _FOOTER_BYTES))
+        return _FOOTER in file.read()
 
 
 def log_pair(stream: rr.RecordingStream, index: int, pair: ScanPair, result: FlowResult,

@@ -74,7 +74,7 @@ def pairs_of_run(run_dir: Path) -> Iterable[Pair]:
     source = provenance.read(run_dir)
     opened = source.dataset
     dataset = open_dataset(opened.folder, opened.loader, opened.sequence, opened.kitti_correction)
-    for index in source.scans[:-1]:
+    for index, _ in source.pairs:
         scan, truth = dataset.scan(index), dataset.truth(index)
         if truth is None or truth.category is None:
             raise SystemExit(f"{run_dir}: no flow with classes is known of scan {scan.name}")

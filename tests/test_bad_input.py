@@ -76,7 +76,8 @@ def test_a_damaged_scan_in_the_middle_keeps_what_was_done(lidarflow, folder, tmp
     truncate(folder / "000002.bin")
     said = lidarflow.complaint("run", folder, "--out", "out")
     assert "000002.bin" in said and "truncated" in said and "kept in out/flow" in said
-    assert sorted(os.listdir(tmp_path / "out")) == ["config.toml", "flow", "source.json"]
+    assert sorted(os.listdir(tmp_path / "out")) == [
+        ".resume", "config.toml", "flow", "source.json"]
     assert os.listdir(tmp_path / "out" / "flow") == ["000000.npz"]
     assert len(io.load_flow(tmp_path / "out" / "flow" / "000000.npz").flow) == len(drive()[0][0])
     assert "cut short" in lidarflow.complaint("view", "out")
@@ -206,7 +207,7 @@ def test_a_foreign_out_folder_is_left_alone_before_any_work(lidarflow, folder, t
     def no_work(*args):
         raise AssertionError("work was done for results that have no place")
 
-    monkeypatch.setattr("lidarflow.pipeline.run", no_work)
+    monkeypatch.setattr("lidarflow.runner.steps", no_work)
     monkeypatch.setattr("lidarflow.pipeline.estimate_flow", no_work)
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "text.tex").write_text("years of work")

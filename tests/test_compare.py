@@ -48,7 +48,7 @@ def test_a_run_of_a_baseline_is_a_run(lidarflow, kitti, tmp_path):
 
 
 def test_an_unknown_method_is_found_before_any_work(lidarflow, kitti, scans, tmp_path, monkeypatch):
-    monkeypatch.setattr("lidarflow.pipeline.run", None)
+    monkeypatch.setattr("lidarflow.runner.steps", None)
     known = "known are ours, zero, ego, icp, ransac_icp"
     out = tmp_path / "out"
     for words in (("pair", *scans[:2], "--method", "icq", "--out", f"{out}.npz"),

@@ -7,6 +7,7 @@ import numpy as np
 from lidarflow.baselines.whole_scan import Registered, WholeScan
 from lidarflow.config import Config
 from lidarflow.lidar import ego
+from lidarflow.lidar.tracking import Tracks
 from lidarflow.types import FlowResult, Scan, ScanPair
 
 
@@ -19,8 +20,9 @@ class Ego(WholeScan):
 
     name = "ego"
 
-    def __init__(self, config: Config | None = None):
-        super().__init__(config)
+    def reset(self) -> None:
+        """Begin anew with the next scan."""
+        super().reset()
         self._odometry = ego.Odometry(self.config)
         self._guess: np.ndarray | None = None
 
@@ -35,6 +37,11 @@ class Ego(WholeScan):
         with self._timed("ego-motion"):
             self._guess = self._odometry.step(scan.points)
         return super().step(scan)
+
+    def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
+        """Take the flow to this scan for known; KISS-ICP sees the scan again."""
+        self._odometry.step(scan.points)
+        super().follow(scan, known, tracks)
 
     def _register(self, pair, source, target) -> Registered:
         with self._timed("ego-motion"):

@@ -10,6 +10,7 @@ from lidarflow import pose
 from lidarflow.config import Config
 from lidarflow.lidar import features, preparation
 from lidarflow.lidar.features import Features, Masks
+from lidarflow.lidar.tracking import Tracks
 from lidarflow.stopwatch import Stopwatch
 from lidarflow.types import FlowResult, Scan, ScanPair, SolveStats
 
@@ -45,8 +46,13 @@ class WholeScan(ABC):
 
     def __init__(self, config: Config | None = None):
         self.config = config or Config()
+        self.tracks = Tracks()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew with the next scan."""
         self._timed = Stopwatch()
-        self._previous: tuple[Scan, Masks | Features] | None = None
+        self._previous: tuple[Scan, Masks | Features | None] | None = None
 
     @classmethod
     def estimate(cls, pair: ScanPair, config: Config | None = None) -> FlowResult:
@@ -63,12 +69,17 @@ class WholeScan(ABC):
         result = None
         if previous is not None:
             pair = ScanPair(previous[0], scan)
-            found = self._register(pair, previous[1], prepared)
+            source = previous[1] if previous[1] is not None else self._prepare(pair.source)
+            found = self._register(pair, source, prepared)
             # Seconds count from the last answer on, so that the first pair bears both its scans.
-            result = self._result(pair.source, previous[1], found, self._timed.seconds)
+            result = self._result(pair.source, source, found, self._timed.seconds)
             self._timed = Stopwatch()
         self._previous = scan, prepared
         return result
+
+    def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
+        """Take the flow to this scan for known; what is needed of the scan is prepared when it is."""
+        self._previous = scan, None
 
     def _prepare(self, scan: Scan) -> Masks | Features:
         """What is needed of one scan."""

@@ -131,13 +131,13 @@ def read_columns(file: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
         raise InstallError(f"{file}: .feather needs the package pyarrow; pip install pyarrow") from None
     try:
         table = feather.read_table(file, memory_map=False)
-    except (ArrowException, OSError, ValueError) as error:
+        table.validate(full=True)     # pyarrow reads past its buffers where offsets lie
+        missing = [name for name in names if name not in table.column_names]
+        if not missing:
+            return {name: table.column(name).to_numpy() for name in names}
+    except (ArrowException, OSError, ValueError, MemoryError) as error:
         raise DataError(f"{file}: not a readable .feather table ({clouds.one_line(error)})") from None
-    missing = [name for name in names if name not in table.column_names]
-    if missing:
-        raise DataError(f"{file}: lacks the columns {', '.join(missing)}; "
-                        f"it has {', '.join(table.column_names)}")
-    return {name: table.column(name).to_numpy() for name in names}
+    raise DataError(f"{file}: lacks the columns {', '.join(missing)}; it has {', '.join(table.column_names)}")
 
 
 def log_folders(folder: Path) -> dict[str, Path]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow.datasets.clouds import one_line
+from lidarflow.datasets.clouds import load_array, one_line
 from lidarflow.errors import DataError
 
 GROUND_M = 0.3     # the official labels call ground what is less far above it, or under it
@@ -37,10 +37,7 @@ def is_ground(folder: Path, points: np.ndarray) -> np.ndarray | None:
 
 
 def _read_raster(file: Path) -> np.ndarray:
-    try:
-        height_m = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{file}: not a readable .npy array ({one_line(error)})") from None
+    height_m = load_array(file)
     if height_m.ndim != 2 or height_m.dtype.kind != "f":
         raise DataError(f"{file}: {height_m.shape} of {height_m.dtype}; expected heights in rows and columns")
     return height_m.astype(np.float64)
@@ -52,5 +49,5 @@ def _read_similarity(file: Path) -> tuple[np.ndarray, np.ndarray, float]:
         values = json.loads(file.read_text(encoding="utf-8"))
         rotation = np.array(values["R"], float).reshape(2, 2)
         return rotation, np.array(values["t"], float).reshape(2), float(values["s"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"{file}: expected R, t and s of a similarity ({one_line(error)})") from None

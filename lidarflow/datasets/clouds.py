@@ -6,17 +6,15 @@ memory, which is why these formats are read here.)
 """
 
 import re
-import tokenize
 import warnings
 import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from lidarflow.datasets import pcd, ply
+from lidarflow.datasets import arrays, pcd, ply
 from lidarflow.datasets.kitti_correction import correct_vertical_angle, is_wanted
 from lidarflow.errors import DataError
 from lidarflow.types import Scan
@@ -104,15 +102,19 @@ def load_arrays(path: Path, keys: Sequence[str] = ()) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise DataError(f"{path}: not an .npz archive, or a truncated one; get it again")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [key for key in keys if key not in archive.files]
-            if missing:
-                held = ", ".join(archive.files) or "nothing"
-                raise DataError(f"{path}: lacks {', '.join(missing)}; it holds {held}")
-            return {key: np.asarray(archive[key]) for key in keys or archive.files}
-    except (OSError, ValueError, EOFError, KeyError, RuntimeError, MemoryError, SyntaxError,
-            tokenize.TokenError, zipfile.BadZipFile, zlib.error) as error:
+        return arrays.from_npz(path, keys)
+    except arrays.MissingArray as error:
+        raise DataError(f"{path}: {error}; it holds {', '.join(error.held) or 'nothing'}") from None
+    except arrays.ERRORS as error:
         raise DataError(f"{path}: not a readable .npz archive of plain arrays ({one_line(error)})") from None
+
+
+def load_array(path: Path) -> np.ndarray:
+    """The array of an .npy file, left on disk until it is used; DataError where it is damaged."""
+    try:
+        return arrays.from_npy(path)
+    except arrays.ERRORS as error:
+        raise DataError(f"{path}: not a readable .npy array ({one_line(error)})") from None
 
 
 def one_line(error: BaseException) -> str:
@@ -145,25 +147,18 @@ def _read_bin(path: Path) -> np.ndarray:
 
 
 def _read_npy(path: Path) -> np.ndarray:
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError, SyntaxError, tokenize.TokenError) as error:
-        raise DataError(f"{path}: not a readable .npy array ({one_line(error)})") from None
-    if not isinstance(array, np.ndarray):
-        array.close()
-        raise DataError(f"{path}: an .npz archive under the name of an .npy file; rename it")
-    return _columns(path, array)
+    return _columns(path, load_array(path))
 
 
 def _read_npz(path: Path) -> np.ndarray:
-    arrays = load_arrays(path)
-    if "points" in arrays:
-        return _columns(path, arrays["points"])
-    fitting = [key for key, array in arrays.items() if _is_cloud(array)]
+    held = load_arrays(path)
+    if "points" in held:
+        return _columns(path, held["points"])
+    fitting = [key for key, array in held.items() if _is_cloud(array)]
     if len(fitting) != 1:
-        shapes = ", ".join(f"{key} {array.shape}" for key, array in arrays.items()) or "nothing"
+        shapes = ", ".join(f"{key} {array.shape}" for key, array in held.items()) or "nothing"
         raise DataError(f"{path}: holds {shapes}; expected an array 'points' (N, 3)")
-    return _columns(path, arrays[fitting[0]])
+    return _columns(path, held[fitting[0]])
 
 
 def _read_text(path: Path) -> np.ndarray:

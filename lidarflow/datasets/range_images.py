@@ -1,5 +1,6 @@
 """Folders of 16-bit range images with their geometry in img.cfg (F. Moosmann's Velodyne recordings)."""
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -44,15 +45,17 @@ class RangeImages(ScanFiles):
         return self._poses
 
     def _read(self, file: Path) -> np.ndarray:
-        try:
-            with Image.open(file) as image:
-                mode, pixels = image.mode, np.asarray(image)
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            raise DataError(f"{file}: not a readable PNG image ({clouds.one_line(error)})") from None
         height, width = self._directions.shape[:2]
-        if pixels.shape != (height, width) or not mode.startswith("I"):
-            raise DataError(f"{file}: an image {pixels.shape} of mode {mode}; "
-                            f"img.cfg says 16-bit {(height, width)}")
+        try:
+            # Out of memory: from a file, Pillow sets aside as much as a damaged chunk says that it holds.
+            with Image.open(BytesIO(file.read_bytes()), formats=("PNG",)) as image:
+                # Before the pixels are unpacked: a header may announce more than fits into memory.
+                if image.size != (width, height) or not image.mode.startswith("I"):
+                    raise DataError(f"{file}: an image {image.size[::-1]} of mode {image.mode}; "
+                                    f"img.cfg says 16-bit {(height, width)}")
+                pixels = np.asarray(image)
+        except (OSError, SyntaxError, ValueError, MemoryError, Image.DecompressionBombError) as error:
+            raise DataError(f"{file}: not a readable PNG image ({clouds.one_line(error)})") from None
         range_m = np.where(pixels > 0, pixels / PIXELS_PER_METRE, np.nan)
         if not np.isfinite(range_m).any():
             raise DataError(f"{file}: empty scan (no pixel has a return); leave this file out")
@@ -75,9 +78,11 @@ def read_directions(file: Path) -> np.ndarray:
     try:
         numbers = [float(word) for word in lines[-1].split(";") if word.strip()]
         width, height, left_deg, right_deg, *pitch_deg = numbers
-    except (IndexError, ValueError):
+        width, height = int(width), int(height)
+        if not np.isfinite(numbers).all():
+            raise ValueError
+    except (IndexError, ValueError, OverflowError):
         raise DataError(f"{file}: expected a line 'width; height; angles in degrees ...'") from None
-    width, height = int(width), int(height)
     if not (0 < width <= 1 << 16 and 0 < height <= 1 << 12 and len(pitch_deg) in (2, height)):
         raise DataError(f"{file}: says {width} x {height} pixels with {len(pitch_deg)} pitch angles; "
                         "expected 2 angles or one per row")

@@ -1,6 +1,7 @@
 """Colour and depth images, and the camera that took them, from files."""
 
 import warnings
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ DEFAULT_DEPTH_SCALE = 5000.0
 _COLOUR_MODES = ("RGB", "RGBA", "RGBX", "P", "L", "LA", "YCbCr", "CMYK")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _MAX_PIXELS = 1 << 26
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")     # others run other programs, or are rarely read
+_MOST_PIXELS_PER_BYTE = 8 * 1032     # one bit each, and packed by deflate as far as that goes
 
 
 def read_frame(color: Path, depth: Path, depth_scale: float = DEFAULT_DEPTH_SCALE, time_ns: int = 0,
@@ -103,12 +106,18 @@ def _opened(path: Path) -> Image.Image:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(path)
+            # Out of memory: from a file, Pillow sets aside as much as a damaged chunk says that it holds.
+            image = Image.open(BytesIO(path.read_bytes()), formats=_FORMATS)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: not a readable image ({one_line(error)})") from None
-    if image.width * image.height > _MAX_PIXELS:
+    pixels = image.width * image.height
+    if pixels > _MAX_PIXELS:
         image.close()
         raise DataError(f"{path}: says {image.width}x{image.height} pixels; more than an RGB-D camera has")
+    if pixels > _MOST_PIXELS_PER_BYTE * path.stat().st_size:
+        image.close()
+        raise DataError(f"{path}: says {image.width}x{image.height} pixels, which its {path.stat().st_size} "
+                        "bytes cannot hold; damaged, get it again")
     return image
 
 

@@ -11,6 +11,7 @@ from lidarflow.datasets.base import frame_number, rows_of_scans
 from lidarflow.errors import DataError
 
 RIGID_TOLERANCE = 1e-3
+_MAX_SECONDS = 9e9
 
 
 def read_lines(path: Path) -> list[str]:
@@ -55,7 +56,16 @@ def motion_of_texts(path: Path, rotation: str, translation: str) -> np.ndarray:
 
 def read_seconds(path: Path) -> list[int]:
     """Times in ns of a file with one time in seconds per line."""
-    return [round(seconds * 1e9) for seconds in read_numbers(path, 1)[:, 0].tolist()]
+    seconds = read_numbers(path, 1)[:, 0]
+    check_seconds(path, seconds)
+    return [round(time_s * 1e9) for time_s in seconds.tolist()]
+
+
+def check_seconds(path: Path, seconds: np.ndarray) -> None:
+    """Raise DataError for times (N,) in seconds that 64-bit nanoseconds do not hold."""
+    if (np.abs(seconds) > _MAX_SECONDS).any():
+        raise DataError(f"{path}: a time of {seconds[np.abs(seconds).argmax()]:g} s; expected seconds, fewer "
+                        f"than {_MAX_SECONDS:g}")
 
 
 def read_dates(path: Path) -> list[int]:

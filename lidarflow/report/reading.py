@@ -79,12 +79,24 @@ def read_run(run_dir: Path, most_pictured: int = MOST_PICTURED) -> Run:
     Raises DataError for a folder that is no run, and for files that are missing or damaged. Data that are not
     at hand any more only cost the error maps.
     """
-    found = _read_metrics(run_dir)
+    figures = read_figures(run_dir)
+    pairs, file = figures["pairs"], run_dir / io.METRICS_FILE
     source, config = provenance.read(run_dir), load(run_dir / io.CONFIG_FILE)
-    file = run_dir / io.METRICS_FILE
+    if len(pairs) != len(source.pairs):
+        raise DataError(f"{file}: {len(pairs)} pairs, but {io.SOURCE_FILE} names the scans of "
+                        f"{len(source.pairs)}; run again")
+    numbers = evenly_chosen(len(pairs), most_pictured)
+    drawn, note = _pictures(run_dir, pairs, numbers)
+    return Run(str(run_dir), source, config, **figures, objects=_read_objects(run_dir / io.OBJECTS_FILE),
+               pictures=drawn, note=note)
+
+
+def read_figures(run_dir: Path) -> dict:
+    """What metrics.json of a run folder holds, by the names that `Run` has for it; DataError if damaged."""
+    found, file = _read_metrics(run_dir), run_dir / io.METRICS_FILE
     try:
-        pairs = rebuilt(tuple[PairReport, ...], found["pairs"], "pairs")
-        known = {
+        return {
+            "pairs": rebuilt(tuple[PairReport, ...], found["pairs"], "pairs"),
             "truth": rebuilt(str, found["truth"], "truth"),
             "mean": rebuilt(dict[str, float], found["mean"], "mean"),
             "std": rebuilt(dict[str, float], found["std"], "std"),
@@ -92,16 +104,9 @@ def read_run(run_dir: Path, most_pictured: int = MOST_PICTURED) -> Run:
             "bucketed": rebuilt(metrics.Bucketed | None, found.get("bucketed"), "bucketed"),
             "by_range": rebuilt(tuple[metrics.Interval, ...], found.get("by_range", []), "by_range"),
             "by_speed": rebuilt(tuple[metrics.Interval, ...], found.get("by_speed", []), "by_speed")}
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{file}: damaged, or of another version ({type(error).__name__}: {error}); "
                         f"write it anew with 'lidarflow eval {run_dir}', or run again") from None
-    if len(pairs) != len(source.scans) - 1:
-        raise DataError(f"{file}: {len(pairs)} pairs, but {io.SOURCE_FILE} names {len(source.scans)} scans; "
-                        "run again")
-    numbers = evenly_chosen(len(pairs), most_pictured)
-    drawn, note = _pictures(run_dir, pairs, numbers)
-    return Run(str(run_dir), source, config, **known, pairs=pairs,
-               objects=_read_objects(run_dir / io.OBJECTS_FILE), pictures=drawn, note=note)
 
 
 def evenly_chosen(count: int, most: int) -> list[int]:

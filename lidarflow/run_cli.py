@@ -1,0 +1,100 @@
+"""What `lidarflow run` and `lidarflow demo` do and say; with cli.py and rgbd_cli.py all that prints."""
+
+import contextlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lidarflow.errors import ConfigError
+from lidarflow.terminal import announce_first_use, check_live_view, progress, show
+
+if TYPE_CHECKING:
+    from lidarflow.config import Config
+    from lidarflow.datasets import Dataset
+    from lidarflow.runner import Going, Viewing
+    from lidarflow.stepping import Skipped
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Who computes a run: so many processes here, or a scheduler's workers; pairs a chunk."""
+
+    workers: int | None
+    scheduler: str | None
+    chunk: int
+
+    @classmethod
+    def wanted(cls, workers: int | None, scheduler: str | None, chunk: int | None) -> "Spread | None":
+        """What the options say, None for this process alone; ConfigError where they contradict each other."""
+        if workers is not None and scheduler is not None:
+            raise ConfigError("--workers and --scheduler: both are given; expected one of them")
+        if workers is None and scheduler is None:
+            if chunk is not None:
+                raise ConfigError(f"--chunk {chunk}: only with --workers or --scheduler")
+            return None
+        from lidarflow import cluster
+
+        return cls(workers, scheduler, chunk or cluster.CHUNK_PAIRS)
+
+
+@contextlib.contextmanager
+def pairs_done(pairs: int):
+    """A bar on standard error; yields what to call with the name of every finished pair."""
+    announce_first_use()
+    with progress("scan pairs", pairs) as bar:
+        yield lambda frame: bar.update(0, advance=1, description=f"scan pairs, {frame} done")
+
+
+def process(
+    dataset: "Dataset", settings: "Config", out: Path, viewing: "Viewing", jump: int, n_scans: int | None,
+    method: str = "ours", going: "Going | None" = None, spread: Spread | None = None,
+) -> None:
+    """Run over a data set and say what was found."""
+    from lidarflow import runner
+    from lidarflow.tables import run_notes, run_table
+
+    check_live_view(viewing.visualize)
+    frames = runner.choose_frames(dataset, jump, n_scans)
+    skipped: list[Skipped] = []
+    going = replace(going or runner.Going(), on_skip=skipped.append, chunk=spread.chunk if spread else 0)
+    if going.resume and runner.is_complete(dataset, frames, settings, out, method, going):
+        print(f"complete   {out}: nothing is left to do")
+        return
+    if spread is not None:
+        _compute(dataset, frames, settings, out, method, going, spread)
+        going = replace(going, resume=True)
+    with pairs_done(len(frames) - 1) as on_pair:
+        reports = runner.process(
+            dataset, frames, settings, out, viewing, lambda report: on_pair(report.frame), method, going)
+    print()
+    for scan in skipped:
+        print(f"skipped    scan {scan.index}: {scan.reason}")
+    if skipped:
+        print(f"skipped    {len(skipped)} of {len(frames)} scans; {len(reports)} pairs are left\n")
+    show(run_table(reports, settings))
+    print()
+    for note in run_notes(reports, settings):
+        print(note)
+    print()
+    print(f"results    {out}")
+    print(f"metrics    {out / 'metrics.json'}")
+    print(f"picture    {out / 'preview.png'}   (the last pair)")
+    if viewing.record:
+        print(f"recording  {out / 'recording.rrd'}")
+        print(f"look at it with: lidarflow view {out}")
+
+
+def _compute(dataset: "Dataset", frames: list[int], settings: "Config", out: Path, method: str,
+             going: "Going", spread: Spread) -> None:
+    """Have the pairs computed by workers; the run is put together of what they find."""
+    from lidarflow import cluster, runner
+
+    chunks = cluster.chunks_of(frames, spread.chunk)
+    kept = runner.begin(dataset, frames, settings, out, method, going)
+    with cluster.connected(spread.workers, spread.scheduler) as client, progress(
+            "scan pairs computed", len(frames) - 1) as bar:
+        there = len(client.scheduler_info(n_workers=-1)["workers"])
+        print(f"workers    {there}, {len(chunks)} chunks of up to {spread.chunk} pairs")
+        cluster.compute(dataset, chunks, settings, method, kept, client, going.skip_bad,
+                        spread.scheduler is None, lambda done: bar.update(0, advance=done.stop - done.start))
+    cluster.join(chunks, kept)

@@ -1,0 +1,331 @@
+"""Nothing is lost: runs that are killed, run out of space or meet damaged scans, and go on afterwards."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from cloud_files import message, write_bin
+from killed import contents, program, was_killed
+
+from lidarflow import io, pose, synthetic
+from lidarflow.checkpoints import Checkpoints, packed
+from lidarflow.config import Config
+from lidarflow.datasets import open_dataset
+from lidarflow.errors import DataError
+from lidarflow.methods import METHODS
+from lidarflow.runner import Going, Viewing, process
+from lidarflow.stepping import steps
+
+QUIET = Viewing(record=False)
+SCANS = 5
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    """A folder of sparse scans of a street with objects that are followed over the pairs."""
+    rng = np.random.default_rng(1)
+    folder = tmp_path_factory.mktemp("street")
+    for k, (scan, _) in enumerate(synthetic.scan_sequence(
+            synthetic.street(rng), synthetic.hdl64e(columns=300), SCANS, rng)):
+        write_bin(folder / f"{k:06d}.bin", scan.points)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def unbroken(street, tmp_path_factory):
+    """The bytes of a run over the street that nothing disturbed."""
+    out = tmp_path_factory.mktemp("unbroken") / "run"
+    process(open_dataset(street), list(range(SCANS)), Config(), out, QUIET)
+    assert not (out / io.RESUME_FOLDER).exists()
+    return contents(out)
+
+
+@pytest.fixture
+def damaged(street, tmp_path):
+    """The street with its third scan cut off."""
+    folder = tmp_path / "damaged"
+    folder.mkdir()
+    for file in street.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes()[:-7 if file.stem == "000002" else None])
+    return folder
+
+
+# Killed at a moment that is chosen.
+
+@pytest.mark.parametrize("place, number, how", [
+    ("os.replace", 1, "before"),                                # before the settings are there
+    ("os.replace", 2, "after"),                                 # after what the run is made of
+    ("numpy.savez_compressed", 2, "before"),          # first flow file there, no checkpoint
+    ("numpy.savez_compressed", 3, "after"),           # second flow file written aside
+    ("lidarflow.checkpoints.packed", 3, "before"),              # flow file in place, checkpoint not
+    ("os.replace", 8, "before"),
+    ("lidarflow.io.write_objects", 1, "before"),                # all pairs done, nothing put together
+    ("lidarflow.io.write_json", 3, "after"),                    # only the checkpoints to be removed
+])
+def test_a_killed_run_resumes_to_the_same_bytes(street, unbroken, tmp_path, place, number, how):
+    out = tmp_path / "run"
+    words = ("run", street, "--out", out, "--no-record", "--resume")
+    assert was_killed(program(words, place, number, how))
+    done = program(words)
+    assert done.returncode == 0, done.stderr
+    assert contents(out) == unbroken
+    assert not list(tmp_path.rglob(".*.part"))
+
+
+def test_pairs_that_are_kept_are_not_computed_again(street, unbroken, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    killed = program(("run", street, "--out", out, "--no-record"), "lidarflow.checkpoints.packed", 4)
+    assert was_killed(killed) and sorted(Checkpoints(out).found()) == [0, 1, 2]
+    computed = []
+    estimator = METHODS["ours"].along(Config())
+    for step in steps(open_dataset(street), list(range(SCANS)), estimator, Checkpoints(out)):
+        computed += [] if step.restored else [step.index]
+    assert computed == [3]
+    process(open_dataset(street), list(range(SCANS)), Config(), out, QUIET, going=Going(resume=True))
+    assert contents(out) == unbroken
+
+
+@pytest.mark.slow
+def test_a_run_killed_again_and_again_at_any_moment_resumes(street, unbroken, tmp_path):
+    out, rng = tmp_path / "run", np.random.default_rng(3)
+    words = [sys.executable, "-c", "from lidarflow.cli import main; main()",
+             "run", str(street), "--out", str(out), "--resume", "--no-record"]
+    kills = 0
+    for _ in range(40):
+        running = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+                                   start_new_session=True)
+        seen = len(list(out.glob("*/*.npz")))
+        while running.poll() is None and len(list(out.glob("*/*.npz"))) == seen:
+            time.sleep(0.01)
+        time.sleep(float(rng.uniform(0.0, 0.5)))
+        if running.poll() is not None:
+            break
+        os.killpg(running.pid, signal.SIGKILL)
+        running.wait()
+        kills += 1
+    assert running.wait() == 0, running.stderr.read()
+    assert kills >= 3
+    assert contents(out) == unbroken
+
+
+@pytest.mark.parametrize("method", ["zero", "ego", "icp", "ransac_icp"])
+def test_every_method_goes_on_as_if_nothing_had_happened(street, tmp_path, method):
+    data, frames, config = open_dataset(street), list(range(SCANS)), Config()
+    process(data, frames, config, tmp_path / "whole", QUIET, method=method)
+
+    def stop(report):
+        if report.frame == "000002":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        process(data, frames, config, tmp_path / "cut", QUIET, stop, method)
+    process(data, frames, config, tmp_path / "cut", QUIET, method=method, going=Going(resume=True))
+    assert contents(tmp_path / "cut") == contents(tmp_path / "whole")
+
+
+def test_a_resumed_run_records_all_pairs(street, tmp_path, lidarflow):
+    out = tmp_path / "run"
+    assert was_killed(program(("run", street, "--out", out), "lidarflow.checkpoints.packed", 3))
+    assert not (out / "recording.rrd").exists()
+    lidarflow.ok("run", street, "--out", out, "--resume")
+    lidarflow.ok("run", street, "--out", tmp_path / "whole")
+    sizes = [(folder / "recording.rrd").stat().st_size for folder in (out, tmp_path / "whole")]
+    assert abs(sizes[0] - sizes[1]) < 0.02 * sizes[1]
+
+
+# What may be resumed.
+
+def test_another_run_is_not_resumed(street, tmp_path, lidarflow):
+    out, other = tmp_path / "run", tmp_path / "other"
+    other.mkdir()
+    for file in street.iterdir():
+        (other / file.name).write_bytes(file.read_bytes())
+    assert was_killed(program(("run", street, "--out", out), "lidarflow.checkpoints.packed", 2))
+    before = contents(out)
+    for words, found in (
+            ((street, "--set", "mesh.max_edge_m=0.5"), "with mesh.max_edge_m = "),
+            ((street, "--method", "icp"), "(Method: ours), not (Method: icp)"),
+            ((other,), f"from {street} (folder"), ((street, "-n", 3), "from scans 0 to 4, not 0 to 2"),
+            ((street, "-j", 1), "from scans 0 to 4, not 1 to 4")):
+        said = lidarflow.complaint("run", *words, "--out", out, "--resume")
+        assert found in said and "--resume" in said
+    assert contents(out) == before
+
+
+def test_data_that_changed_are_noticed(street, tmp_path, lidarflow):
+    data, out = tmp_path / "data", tmp_path / "run"
+    data.mkdir()
+    for file in street.iterdir():
+        (data / file.name).write_bytes(file.read_bytes())
+    assert was_killed(program(("run", data, "--out", out), "lidarflow.checkpoints.packed", 3))
+    first = np.fromfile(data / "000000.bin", "<f4")
+    first[0] += 1.0
+    first.tofile(data / "000000.bin")
+    assert "the data changed" in lidarflow.complaint("run", data, "--out", out, "--resume", "--skip-bad")
+
+
+def test_a_complete_run_has_nothing_left_to_do(street, tmp_path, lidarflow):
+    out = tmp_path / "run"
+    words = ("run", street, "--out", out, "--resume", "-n", 2, "--method", "zero", "--no-record")
+    lidarflow.ok(*words)      # nothing there yet: begins anew
+    before = {file: file.stat().st_mtime_ns for file in out.rglob("*")}
+    assert "nothing is left to do" in lidarflow.ok(*words)
+    assert {file: file.stat().st_mtime_ns for file in out.rglob("*")} == before
+    lidarflow.ok(*words[:4], *words[5:])
+    assert {file: file.stat().st_mtime_ns for file in out.rglob("*")} != before
+
+
+# Checkpoints.
+
+def test_a_checkpoint_comes_back_to_the_last_bit(street, tmp_path):
+    for method in METHODS:
+        estimator, kept = METHODS[method].along(Config()), Checkpoints(tmp_path / method)
+        for step in steps(open_dataset(street), [0, 1, 2], estimator):
+            kept.save(step.index, step.pair, step.result, step.tracks)
+            result, tracks = kept.load(step.index, step.pair)
+            assert packed(step.pair, result, tracks) == packed(step.pair, step.result, step.tracks)
+            for name in ("flow", "motions", "valid", "std_m", "object_id", "match_target", "ego_motion"):
+                np.testing.assert_array_equal(getattr(result, name), getattr(step.result, name))
+            assert result.seconds == step.result.seconds and len(result.objects) == len(step.result.objects)
+            assert tracks.next_id == step.tracks.next_id
+            for found, made in zip(tracks.followed, step.tracks.followed, strict=True):
+                np.testing.assert_array_equal(found.points, made.points)
+                np.testing.assert_array_equal(found.over_ground, made.over_ground)
+                assert (found.id, found.missed) == (made.id, made.missed)
+
+
+def test_a_damaged_checkpoint_is_named(street, tmp_path):
+    kept = Checkpoints(tmp_path)
+    step = next(steps(open_dataset(street), [0, 1], METHODS["zero"].along(Config())))
+    kept.save(0, step.pair, step.result, step.tracks)
+    file, = kept.folder.iterdir()
+    file.write_bytes(file.read_bytes()[:-30])
+    assert str(file) in message(kept.load, 0, step.pair)
+
+
+# Damaged scans.
+
+def test_a_damaged_scan_stops_the_run_and_everything_before_is_kept(damaged, tmp_path, lidarflow, unbroken):
+    out = tmp_path / "run"
+    said = lidarflow.complaint("run", damaged, "--out", out, "--no-record")
+    assert "000002.bin" in said and "flow of 1 before is kept" in said and "--skip-bad" in said
+    assert (out / "flow" / "000000.npz").read_bytes() == unbroken["flow/000000.npz"]
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_damaged_scan_is_skipped_and_counted(damaged, tmp_path, lidarflow, resumed):
+    out = tmp_path / "run"
+    if resumed:
+        lidarflow.complaint("run", damaged, "--out", out, "--no-record")
+    told = lidarflow.ok("run", damaged, "--out", out, "--skip-bad", *(["--resume"] if resumed else ()))
+    assert "skipped    scan 2: " in told and "000002.bin" in told and "skipped    1 of 5 scans; 2" in told
+    assert sorted(os.listdir(out / "flow")) == ["000000.npz", "000003.npz"]
+    scored = json.loads((out / "metrics.json").read_text())
+    assert [scan["scan"] for scan in scored["skipped"]] == [2] and len(scored["pairs"]) == 2
+    assert json.loads((out / "source.json").read_text())["skipped"] == [2]
+    poses = np.loadtxt(out / "poses_kitti.txt").reshape(-1, 3, 4)
+    assert len(poses) == 5 and len(np.loadtxt(out / "poses_tum.txt")) == 4
+    step = pose.identity()
+    step[:3] = poses[1]
+    np.testing.assert_allclose((pose.identity() @ step @ step @ step)[:3], poses[3], atol=1e-9)
+    ids = [row.split(",")[:2] for row in (out / "objects.csv").read_text().splitlines()[1:]]
+    before, after = ({number for frame, number in ids if frame == name} for name in ("000000", "000003"))
+    assert before and not before & after      # a number is never given to another object
+    lidarflow.ok("report", out, "--out", tmp_path / "report.html")
+
+
+def test_the_pair_after_a_gap_is_that_of_a_run_that_begins_there(damaged, street, tmp_path):
+    process(open_dataset(damaged), list(range(SCANS)), Config(), tmp_path / "gap", QUIET,
+            going=Going(skip_bad=True))
+    process(open_dataset(street), [3, 4], Config(), tmp_path / "fresh", QUIET)
+    gap, fresh = (io.load_flow(tmp_path / name / "flow" / "000003.npz") for name in ("gap", "fresh"))
+    np.testing.assert_array_equal(gap.flow, fresh.flow)
+    np.testing.assert_array_equal(gap.object_id >= 0, fresh.object_id >= 0)
+
+
+def test_nothing_but_damaged_scans(street, tmp_path, lidarflow):
+    data = tmp_path / "data"
+    data.mkdir()
+    for file in street.iterdir():
+        (data / file.name).write_bytes(file.read_bytes()[:-7])
+    said = lidarflow.complaint("run", data, "--out", tmp_path / "run", "--skip-bad")
+    assert "no two neighbouring scans" in said and "000000.bin" in said
+    assert not (tmp_path / "run").exists()
+
+
+# Discs.
+
+def small_disc(folder, megabytes):
+    """A file system of this size mounted on `folder`, or a skipped test where that is not allowed."""
+    folder.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "tmpfs", str(folder)]
+    if sys.platform != "linux" or subprocess.run(words, capture_output=True, check=False).returncode:
+        pytest.skip("a small file system can only be mounted by root on Linux")
+
+
+@pytest.mark.parametrize("record", ["--record", "--no-record"])
+def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_space(street, unbroken, tmp_path, record):
+    disc = tmp_path / "disc"
+    small_disc(disc, 2)
+    try:
+        words = ("run", street, "--out", disc / "run", record, "--resume")
+        done = program(words)
+        assert done.returncode == 1 and "Traceback" not in done.stderr
+        assert done.stderr.startswith("lidarflow: ") and done.stderr.count("\n") == 1, done.stderr
+        assert "No space left" in done.stderr or "cannot be written" in done.stderr
+        assert not list(disc.rglob("*.part"))
+        for file in (disc / "run").rglob("*.npz"):
+            np.load(file).close()
+        subprocess.run(["mount", "-o", "remount,size=200m", str(disc)], check=True)
+        done = program(words)
+        assert done.returncode == 0, done.stderr
+        assert contents(disc / "run") == unbroken
+    finally:
+        subprocess.run(["umount", "-l", str(disc)], check=False)
+
+
+def test_a_recording_that_does_not_fit_is_not_taken_for_one(street, tmp_path):
+    """Rerun only logs that it could not write; the command notices that the end is missing."""
+    disc = tmp_path / "disc"
+    small_disc(disc, 1)
+    try:
+        pair = sorted(street.iterdir())[:2]
+        done = program(("pair", *pair, "--out", tmp_path / "flow.npz", "--recording", disc / "flow.rrd"))
+        assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+        assert "the end of the recording is missing" in done.stderr or "No space left" in done.stderr
+        assert os.listdir(disc) == [] and not (tmp_path / "flow.npz").exists()
+    finally:
+        subprocess.run(["umount", "-l", str(disc)], check=False)
+
+
+def test_files_that_may_not_grow_are_one_line(street, tmp_path, monkeypatch, lidarflow):
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(io.np, "savez_compressed", full)
+    said = lidarflow.complaint("run", street, "--out", tmp_path / "run", "--method", "zero", "--no-record")
+    assert "No space left" in said and not list(tmp_path.rglob("*.part"))
+
+
+def test_a_read_only_place_is_one_line(street, tmp_path, lidarflow):
+    disc = tmp_path / "disc"
+    small_disc(disc, 1)
+    try:
+        subprocess.run(["mount", "-o", "remount,ro", str(disc)], check=True)
+        for words in (("run", street, "--out", disc / "run"),
+                      ("pair", street / "000000.bin", street / "000001.bin", "--out", disc / "flow.npz")):
+            assert "cannot" in lidarflow.complaint(*words)
+        assert os.listdir(disc) == []
+    finally:
+        subprocess.run(["umount", "-l", str(disc)], check=False)
+
+
+def test_an_unreadable_run_folder_is_a_lidarflow_error(street, tmp_path):
+    (tmp_path / "run").write_text("a file")
+    with pytest.raises(DataError):
+        process(open_dataset(street), [0, 1], Config(), tmp_path / "run", QUIET)
