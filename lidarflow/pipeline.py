@@ -164,22 +164,23 @@ def prepare(
 ) -> Prepared:
     """All of a pair that comes before objects and solver; raises DataError for scans that cannot be used.
 
-    `previous` is what the pair before left, and `tracks` its objects'; `ego_guess` is a start value (4, 4) for
-    the ego-motion, `timed` goes on measuring stages.
+    `previous` is what the pair before left, `tracks` its objects; `ego_guess` is a start value (4, 4) for the
+    ego-motion, `timed` goes on measuring stages.
     """
     timed = timed or Stopwatch()
     for scan in (pair.source, pair.target):
         preparation.require_points(scan, config.preparation)
     points = pair.source.points
     with timed("features"):
-        known = previous is not None and previous.target is not None
-        source = previous.target if known else features.extract(pair.source, config)
+        before = previous.target if previous else None
+        source = before if before is not None else features.extract(pair.source, config)
         target = features.extract(pair.target, config)
     with timed("ego-motion"):
         ego_motion = ego.find(
             points[source.usable], pair.target.points[target.usable], ego_guess, config.ego)
     with timed("mesh"):
-        source_mesh = previous.target_mesh if known else _mesh(pair.source, source, config)
+        mesh_before = previous.target_mesh if previous else None
+        source_mesh = mesh_before if mesh_before is not None else _mesh(pair.source, source, config)
         target_mesh = _mesh(pair.target, target, config)
     tracks, search = tracks or Tracks(), None
     if config.objects.enabled:
