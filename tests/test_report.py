@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from command_line import Program, drive, rests
 from PIL import Image
-from test_evaluation import CONFIG, OFF_M, write_run
+from run_folders import CONFIG, OFF_M, write_run
 from test_preview import MOVER, street
 
 from lidarflow import evaluation, io, metrics, preview, provenance, report, runner, synthetic
