@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from cloud_files import write_bin
 
 from lidarflow import cli, synthetic
 
@@ -14,6 +15,15 @@ def drive():
     """Three sparse scans of a street, 0.1 s apart, with their truth."""
     rng = np.random.default_rng(0)
     return synthetic.scan_sequence(synthetic.street(rng), synthetic.hdl64e(columns=300), 3, rng)
+
+
+def street_folder(folder, scans, columns=300, seed=1):
+    """A folder of sparse scans of a street, with objects that are followed over the pairs."""
+    rng = np.random.default_rng(seed)
+    drive = synthetic.scan_sequence(synthetic.street(rng), synthetic.hdl64e(columns=columns), scans, rng)
+    for k, (scan, _) in enumerate(drive):
+        write_bin(folder / f"{k:06d}.bin", scan.points)
+    return folder
 
 
 def rounded(points):

@@ -10,12 +10,12 @@ import time
 
 import numpy as np
 import pytest
-from cloud_files import write_bin
+from command_line import street_folder
 from killed import contents, program
 
 pytest.importorskip("distributed", reason="Dask distributed is not installed: pip install 'lidarflow[dask]'")
 
-from lidarflow import cluster, io, synthetic
+from lidarflow import cluster, io
 from lidarflow.checkpoints import Checkpoints, Numbers, numbers_of, packed, renumbered
 from lidarflow.cluster import WARM_UP_PAIRS, WARM_UP_SCANS, Chunk
 from lidarflow.config import Config
@@ -30,12 +30,7 @@ QUIET = Viewing(record=False)
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    rng = np.random.default_rng(1)
-    folder = tmp_path_factory.mktemp("street")
-    for k, (scan, _) in enumerate(synthetic.scan_sequence(
-            synthetic.street(rng), synthetic.hdl64e(columns=300), SCANS, rng)):
-        write_bin(folder / f"{k:06d}.bin", scan.points)
-    return folder
+    return street_folder(tmp_path_factory.mktemp("street"), SCANS)
 
 
 @pytest.fixture(scope="module")
@@ -211,12 +206,9 @@ def test_objects_keep_their_numbers_across_chunks(street, tmp_path):
 @pytest.mark.slow
 def test_chunks_differ_little_where_the_warm_up_does_not_reach_the_start(tmp_path):
     """Odometry has seen less of the way than in one go: the flow of nearly all points is the same to 1 mm."""
-    rng = np.random.default_rng(2)
-    scans, data = 26, tmp_path / "data"
-    for k, (scan, _) in enumerate(synthetic.scan_sequence(
-            synthetic.street(rng), synthetic.hdl64e(columns=200), scans, rng)):
-        write_bin(data / f"{k:06d}.bin", scan.points)
-    dataset, frames = open_dataset(data), list(range(scans))
+    scans = 26
+    dataset = open_dataset(street_folder(tmp_path / "data", scans, columns=200, seed=2))
+    frames = list(range(scans))
     chunk = cluster.chunks_of(frames, 20)[1]
     assert chunk.seen == 6
     process(dataset, frames, Config(), tmp_path / "run", QUIET)

@@ -9,10 +9,11 @@ import time
 
 import numpy as np
 import pytest
-from cloud_files import message, write_bin
+from cloud_files import message
+from command_line import street_folder
 from killed import contents, program, was_killed
 
-from lidarflow import io, pose, synthetic
+from lidarflow import io, pose
 from lidarflow.checkpoints import Checkpoints, packed
 from lidarflow.config import Config
 from lidarflow.datasets import open_dataset
@@ -27,13 +28,7 @@ SCANS = 5
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    """A folder of sparse scans of a street with objects that are followed over the pairs."""
-    rng = np.random.default_rng(1)
-    folder = tmp_path_factory.mktemp("street")
-    for k, (scan, _) in enumerate(synthetic.scan_sequence(
-            synthetic.street(rng), synthetic.hdl64e(columns=300), SCANS, rng)):
-        write_bin(folder / f"{k:06d}.bin", scan.points)
-    return folder
+    return street_folder(tmp_path_factory.mktemp("street"), SCANS)
 
 
 @pytest.fixture(scope="module")
