@@ -121,7 +121,9 @@ class FlowEstimator:
     def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
         """Take `known` for the flow from the last scan to this one; only KISS-ICP sees the scan again."""
         self._odometry.step(scan.points)
-        self._previous = None if known is None else Previous(self._scan.points, known)
+        last, self._previous = self._scan, None
+        if last is not None and known is not None:
+            self._previous = Previous(last.points, known)
         self._scan, self.tracks = scan, tracks
 
 
