@@ -35,12 +35,12 @@ def progress(what: str, total: int):
 
 
 def announce_first_use() -> None:
-    """A line on standard error where kernels have not been compiled on this machine yet."""
+    """A line on a terminal's standard error where kernels have not been compiled on this machine yet."""
     from lidarflow.kernels.compiled import are_cached
 
-    if not are_cached():
-        console(sys.stderr).print(
-            "first use: compiling for this machine takes a minute or two; later starts skip it")
+    on = console(sys.stderr)
+    if on.is_terminal and not are_cached():
+        on.print("first use: compiling for this machine takes a minute or two; later starts skip it")
 
 
 def check_live_view(wanted: bool) -> None:
