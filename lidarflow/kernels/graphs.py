@@ -3,6 +3,7 @@
 import numpy as np
 
 from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.union_find import join, labels
 
 
 def sides(triangles: np.ndarray, count: int) -> np.ndarray:
@@ -45,25 +46,5 @@ def _sides(triangles, count):
 def _components(edges, count):
     parent = np.arange(count)
     for e in range(len(edges)):
-        a, b = _root(parent, edges[e, 0]), _root(parent, edges[e, 1])
-        if a < b:
-            parent[b] = a
-        else:
-            parent[a] = b
-    label, found = np.empty(count, np.int32), 0
-    for i in range(count):   # a root is the first of its component
-        root = _root(parent, i)
-        if root == i:
-            label[i] = found
-            found += 1
-        else:
-            label[i] = label[root]
-    return label
-
-
-@njit(inline="always")
-def _root(parent, i):
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
+        join(parent, edges[e, 0], edges[e, 1])
+    return labels(parent).astype(np.int32)

@@ -7,6 +7,7 @@ import numpy as np
 from lidarflow.kernels import grid
 from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.union_find import join, labels
 
 _CELLS_PER_LINK = 3
 
@@ -70,23 +71,5 @@ def _linked(points, tree, link_m):
     for i in range(len(points)):
         count = trees.all_within(tree, points[i, 0], points[i, 1], points[i, 2], link_m * link_m, found)
         for k in range(count):
-            a, b = _root(parent, i), _root(parent, tree.rows[found[k]])
-            parent[max(a, b)] = min(a, b)
-    label, count = np.empty(len(points), np.int64), 0
-    for i in range(len(points)):
-        root = _root(parent, i)
-        if root == i:
-            label[i] = count
-            count += 1
-        else:
-            label[i] = label[root]
-    return label
-
-
-@njit()
-def _root(parent, i):
-    """The lowest member known of i's component; the way there is halved for the next time."""
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
+            join(parent, i, tree.rows[found[k]])
+    return labels(parent)

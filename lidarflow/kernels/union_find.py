@@ -1,0 +1,35 @@
+"""Disjoint sets: which of N things hang together, told pair by pair."""
+
+import numpy as np
+
+from lidarflow.kernels.compiled import njit
+
+
+@njit()
+def join(parent, a, b):
+    """Put a and b into one set; `parent` (N,) begins as 0 .. N-1."""
+    a, b = _root(parent, a), _root(parent, b)
+    parent[max(a, b)] = min(a, b)
+
+
+@njit()
+def labels(parent):
+    """Label (N,) of each thing's set, numbered in the order of their first members."""
+    label, count = np.empty(len(parent), np.int64), 0
+    for i in range(len(parent)):   # a root is the first of its set
+        root = _root(parent, i)
+        if root == i:
+            label[i] = count
+            count += 1
+        else:
+            label[i] = label[root]
+    return label
+
+
+@njit()
+def _root(parent, i):
+    """The lowest member known of i's set; the way there is halved for the next time."""
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
