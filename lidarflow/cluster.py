@@ -32,6 +32,8 @@ WARM_UP_SCANS = 10     # before these: KISS-ICP's map and thresholds have settle
 _RETRIES = 2
 _HERE = "127.0.0.1"      # nobody else is to reach what runs on this machine
 _SAME_SHARE = 0.5      # of an object's points, for it to be the same in two chunks
+# Set in the workers once they run: what Dask sets before it starts one stays in this process too, where numba
+# would take fright at another number of threads than it has.
 _THREADS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
             "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
 
@@ -178,7 +180,7 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator:
             yield client
         return
     local = {"host": _HERE, "dashboard_address": f"{_HERE}:0", "worker_dashboard_address": f"{_HERE}:0"}
-    with (dask.config.set({"distributed.nanny.pre-spawn-environ": _THREADS}),
+    with (dask.config.set({"distributed.nanny.environ": _THREADS}),
           distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True,
                                    silence_logs=logging.CRITICAL, **local) as cluster,
           distributed.Client(cluster, set_as_default=False) as client):

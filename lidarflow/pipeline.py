@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -263,7 +262,8 @@ def _refined(
         surface = refinement.Surface.around(
             part.problem.points, pair.target.points, target.usable & ~target.ground, prepared.target_mesh)
         motions = refinement.refined(
-            part.problem, motions, surface, partial(solve, min_matches=config.graph.min_matches),
+            part.problem, motions, surface,
+            lambda problem, settings: solve(problem, settings, config.graph.min_matches),
             refinement.solver(config.solver, limits), limits)
     return part, motions
 

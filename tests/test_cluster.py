@@ -149,12 +149,15 @@ def test_no_scheduler_is_one_line(street, tmp_path):
 def test_workers_here_are_reached_from_here_only():
     import psutil
 
+    before = os.environ.get("NUMBA_NUM_THREADS")
     with cluster.connected(1, None) as client:
         processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
         listening = [connection.laddr.ip for process in processes for connection in process.net_connections()
                      if connection.status == psutil.CONN_LISTEN]
-        assert client.submit(os.environ.get, "NUMBA_NUM_THREADS").result() == "1"
+        assert client.submit(os.getenv, "NUMBA_NUM_THREADS").result() == "1"
+        assert client.submit(os.getenv, "OMP_NUM_THREADS").result() == "1"
         assert set(client.nthreads().values()) == {1}
+    assert os.environ.get("NUMBA_NUM_THREADS") == before, "this process has threads of its own"
     assert len(listening) >= 3 and set(listening) == {"127.0.0.1"}
 
 
