@@ -35,7 +35,8 @@ _MATCHED_NEAR_M = 1.5   # of the seeds of objects; a car's other end is farther,
 class Previous:
     """What one pair leaves for the next: source points and result, its target's features and mesh.
 
-    Features and mesh are None where the result was known already; they are made again when they are needed.
+    Features and mesh are None where the result was known already, the mesh also where nothing is refined
+    (`refine.rounds`); they are made when they are needed.
     """
 
     points: np.ndarray
@@ -152,7 +153,7 @@ class Prepared:
     target: features.Features
     ego_motion: np.ndarray
     mesh: Mesh
-    target_mesh: Mesh
+    target_mesh: Mesh | None
     tracks: Tracks
     search: Search | None
     graph: frontend.Graph
@@ -182,7 +183,7 @@ def prepare(
     with timed("mesh"):
         mesh_before = previous.target_mesh if previous else None
         source_mesh = mesh_before if mesh_before is not None else _mesh(pair.source, source, config)
-        target_mesh = _mesh(pair.target, target, config)
+        target_mesh = _mesh(pair.target, target, config) if config.refine.rounds else None
     tracks, search = tracks or Tracks(), None
     if config.objects.enabled:
         with timed("evidence"):
@@ -218,9 +219,10 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
     with timed("solver"):
         motions, solved, stats = solve(graph.problem, config.solver, config.graph.min_matches)
     with timed("refinement"):
-        near_things, refined = _refined(prepared, _spread(by_group, graph, motions), found, config)
+        dense = _spread(by_group, graph, motions)
+        near_things, refined = _refined(prepared, dense, found, config)
     with timed("dense answer"):
-        dense = _spread(_spread(by_group, graph, motions), near_things, refined)
+        dense = _spread(dense, near_things, refined)
         flow = pose.apply(dense, points) - points
         in_graph = (graph.variable >= 0) | (near_things.variable >= 0)
         is_solved = (near_things.variable >= 0) | np.append(solved, False)[graph.variable]
@@ -258,9 +260,9 @@ def _refined(
     kept = refinement.wanted(prepared.graph.problem, is_rigid[owner], limits)
     part = frontend.tied(prepared.graph, kept, found.owner, found.motions, prepared.ego_motion)
     motions = dense[part.rows]
-    if len(motions):
+    if len(motions) and prepared.target_mesh is not None:
         surface = refinement.Surface.around(
-            part.problem.points, pair.target.points, target.usable & ~target.ground, prepared.target_mesh)
+            part.problem.points, pair.target.points, target.cloud.upright.tree, prepared.target_mesh)
         motions = refinement.refined(
             part.problem, motions, surface,
             lambda problem, settings: solve(problem, settings, config.graph.min_matches),

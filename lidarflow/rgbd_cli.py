@@ -143,6 +143,7 @@ def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Pat
     """Run over a folder and say what was found."""
     from lidarflow import rgbd_runner, runner
     from lidarflow.rgbd_tables import run_notes, run_table
+    from lidarflow.tables import where_results_are
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(folder, jump, n_frames, "frames")
@@ -159,12 +160,8 @@ def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Pat
     for note in run_notes(done):
         print(note)
     print()
-    print(f"results    {out}")
-    print(f"metrics    {out / 'metrics.json'}")
-    print(f"picture    {out / 'preview.png'}   (the last pair)")
-    if viewing.record:
-        print(f"recording  {out / 'recording.rrd'}")
-        print(f"look at it with: lidarflow view {out}")
+    for line in where_results_are(out, viewing.record):
+        print(line)
 
 
 def _settings(file: Path | None, overrides: list[str] | None) -> "RgbdConfig":

@@ -51,7 +51,7 @@ def process(
 ) -> None:
     """Run over a data set and say what was found."""
     from lidarflow import runner
-    from lidarflow.tables import run_notes, run_table
+    from lidarflow.tables import run_notes, run_table, where_results_are
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(dataset, jump, n_scans)
@@ -76,12 +76,8 @@ def process(
     for note in run_notes(reports, settings):
         print(note)
     print()
-    print(f"results    {out}")
-    print(f"metrics    {out / 'metrics.json'}")
-    print(f"picture    {out / 'preview.png'}   (the last pair)")
-    if viewing.record:
-        print(f"recording  {out / 'recording.rrd'}")
-        print(f"look at it with: lidarflow view {out}")
+    for line in where_results_are(out, viewing.record):
+        print(line)
 
 
 def _compute(dataset: "Dataset", frames: list[int], settings: "Config", out: Path, method: str,

@@ -1,5 +1,7 @@
 """Tables for people, from reports; nothing here prints."""
 
+from pathlib import Path
+
 import numpy as np
 from rich import box
 from rich.table import Table
@@ -148,6 +150,15 @@ def pair_table(pair: ScanPair, result: FlowResult, alignment: Alignment) -> Tabl
         table.add_row("note", doubt)
     table.add_row("seconds", ", ".join(f"{stage} {s:.1f}" for stage, s in result.seconds.items()))
     return table
+
+
+def where_results_are(out: Path, is_recorded: bool) -> list[str]:
+    """What a run over a sequence says at its end, a line each."""
+    told = [f"results    {out}", f"metrics    {out / 'metrics.json'}",
+            f"picture    {out / 'preview.png'}   (the last pair)"]
+    if is_recorded:
+        told += [f"recording  {out / 'recording.rrd'}", f"look at it with: lidarflow view {out}"]
+    return told
 
 
 def config_table(kind: type = Config) -> Table:

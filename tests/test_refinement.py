@@ -8,6 +8,7 @@ from worlds import grid_edges
 
 from lidarflow import open3d_import, pose, synthetic
 from lidarflow.config import Config, RefineConfig, load
+from lidarflow.kernels import tree
 from lidarflow.lidar import mesh, refinement
 from lidarflow.pipeline import estimate_flow
 from lidarflow.synthetic.human_motion import LIMBS
@@ -61,12 +62,13 @@ def test_the_nearest_place_lies_within_a_triangle_and_else_on_a_point():
     points = np.array([[5.0, 0.0, 0.0], [5.0, 1.0, 0.0], [5.0, 0.0, 1.0], [5.0, 3.0, 0.0], [5.0, 0.0, 9.0]])
     one_triangle = mesh.Mesh(np.array([[0, 1, 2]], np.int32), np.array([[0, 1], [0, 2], [1, 2]], np.int32),
                              np.array([0, 0, 0, 1, 2], np.int32), "grid")
-    kept = np.ones(5, bool)
-    surface = refinement.Surface.around(points[:4], points, kept, one_triangle)
+    surface = refinement.Surface.around(points[:4], points, tree.build(points), one_triangle)
     asked = np.array([[5.2, 0.25, 0.25], [4.9, 2.9, 0.1], [5.1, -0.3, 0.5]])
     np.testing.assert_allclose(
         surface.nearest(asked), [[5.0, 0.25, 0.25], [5.0, 3.0, 0.0], [5.0, 0.0, 0.5]], atol=1e-6)
-    bare = refinement.Surface.around(points[:4], points, kept & (np.arange(5) != 1), one_triangle)
+    no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(5), "grid")
+    without_corner = tree.build(np.delete(points, 1, axis=0))
+    bare = refinement.Surface.around(points[:4], points, without_corner, no_triangles)
     np.testing.assert_allclose(bare.nearest(asked[:1]), [[5.0, 0.0, 0.0]], atol=1e-6)
 
 
@@ -75,10 +77,18 @@ def test_places_out_of_reach_say_nothing():
     points = problem.points + [0.1, 0.0, 0.0]
     points[problem.points[:, 2] > 0.9, 0] += 1.0
     no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(16), "grid")
-    surface = refinement.Surface.around(problem.points, points, np.ones(16, bool), no_triangles)
+    surface = refinement.Surface.around(problem.points, points, tree.build(points), no_triangles)
     matched = refinement.rematched(problem, problem.initial, surface, 0.3)
     np.testing.assert_array_equal(matched.match_index, np.flatnonzero(problem.points[:, 2] < 0.9))
     np.testing.assert_allclose(matched.match_target, points[matched.match_index])
+
+
+def test_a_scan_without_a_point_upright_says_nothing():
+    problem = patches((8.0, 1.0))
+    no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(4), "grid")
+    ground = np.array([[8.0, y, -1.7] for y in range(4)])
+    surface = refinement.Surface.around(problem.points, ground, tree.build(np.empty((0, 3))), no_triangles)
+    assert len(refinement.rematched(problem, problem.initial, surface, 0.3).match_index) == 0
 
 
 # ---- people -----------------------------------------------------------------------------------------------

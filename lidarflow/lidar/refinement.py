@@ -9,10 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidarflow import pose
 from lidarflow.config import RefineConfig, SolverConfig
+from lidarflow.kernels import neighbours
+from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.mesh import Mesh
 from lidarflow.open3d_import import open3d
 from lidarflow.types import FlowProblem
@@ -28,19 +29,19 @@ class Surface:
     The nearest return is no measure of where a surface is: rings lie far apart and travel with the sensor,
     and what is pulled to the nearest of them is pulled along the surface. Triangles fill the gaps.
 
-    points     cKDTree                     of the points, for those without a triangle
+    upright    Tree                        of the points, for those without a triangle
     triangles  RaycastingScene or None     None without triangles
     """
 
-    points: cKDTree
+    upright: Tree
     triangles: object
 
     @classmethod
-    def around(cls, places: np.ndarray, points: np.ndarray, kept: np.ndarray, mesh: Mesh) -> "Surface":
-        """Of the `kept` rows (N,) of a scan's points (N, 3), metres, and its mesh, around places (M, 3)."""
+    def around(cls, places: np.ndarray, points: np.ndarray, upright: Tree, mesh: Mesh) -> "Surface":
+        """Of a scan's points (N, 3), metres, those that stand upright, and its mesh around places (M, 3)."""
         with np.errstate(invalid="ignore"):
             inside = (points >= places.min(axis=0) - _MARGIN_M) & (points <= places.max(axis=0) + _MARGIN_M)
-        near = kept & inside.all(axis=1)
+        near = inside.all(axis=1)
         triangles = mesh.triangles[near[mesh.triangles].all(axis=1)]
         scene = None
         if len(triangles):
@@ -49,12 +50,11 @@ class Surface:
             vertices = np.where(near[:, None], points, 0.0)   # no triangle uses the others
             scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)),
                                 o3d.core.Tensor(triangles.astype(np.uint32)))
-        return cls(cKDTree(points[near]), scene)
+        return cls(upright, scene)
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
-        """Nearest places (N, 3) on the surface to points (N, 3), metres, in the scan's frame."""
-        off_m, row = self.points.query(points, workers=-1)
-        places = self.points.data[row]
+        """Nearest places (N, 3) on the surface to points (N, 3), metres; NaN where there is none."""
+        places, off_m = neighbours.nearest_points(self.upright, points)
         if self.triangles is None:
             return places
         query = open3d().core.Tensor(points.astype(np.float32))
@@ -121,5 +121,4 @@ def wanted(problem: FlowProblem, is_rigid: np.ndarray, config: RefineConfig) -> 
     size_m = np.maximum.reduceat(ordered, first) - np.minimum.reduceat(ordered, first)
     nearest_m = np.minimum.reduceat(np.linalg.norm(ordered, axis=1), first)
     small = (size_m <= config.max_size_m).all(axis=1) & (nearest_m <= config.max_range_m)
-    _, rank = np.unique(problem.component, return_inverse=True)
-    return (small & ~np.logical_or.reduceat(is_rigid[order], first))[rank]
+    return (small & ~np.logical_or.reduceat(is_rigid[order], first))[problem.component]

@@ -14,7 +14,8 @@ from lidarflow.open3d_import import open3d
 _SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range: indoors all is smaller
 _NORMAL_RADIUS_VOXELS = 3.5
 _MIN_POINTS = 30
-_SETTLED = 1e-7              # relative change of fit and residual that ends a point-to-point ICP
+_SETTLED = 1e-5              # a step that stays below it, in metres and radians, ends a registration
+_SETTLED_SHARE = 1e-7        # relative change of fit and residual that ends a point-to-point ICP
 _MOST_ROUNDS = 30
 _HOLD = 1e-9
 _REPRODUCIBLE_DECIMALS = 9
@@ -54,12 +55,11 @@ class Planes:
 
 
 def robust_point_to_plane(
-    source: np.ndarray, target: Planes, reach_m: float, start: np.ndarray, settled: float = 1e-5
+    source: np.ndarray, target: Planes, reach_m: float, start: np.ndarray
 ) -> np.ndarray:
     """target_from_source (4, 4) of points (N, 3) from `start` (4, 4), by Gauss-Newton steps.
 
-    Tukey's loss, `reach_m` wide, lets moving objects go. It ends when a step stays below `settled`, in metres
-    and radians.
+    Tukey's loss, `reach_m` wide, lets moving objects go.
     """
     motion, pairs = start, kernel.Pairs(len(source))
     for _ in range(_MOST_ROUNDS):
@@ -70,15 +70,18 @@ def robust_point_to_plane(
         # What no plane holds, as in a corridor, is left where it is.
         step = np.linalg.solve(matrix + _HOLD * np.trace(matrix) * np.eye(6), right)
         motion = pose.exp(step) @ motion
-        if np.abs(step).max() < settled:
+        if np.abs(step).max() < _SETTLED:
             break
     return motion
 
 
 def point_to_point(source, target, reach_m: float, start: np.ndarray) -> np.ndarray:
     """target_from_source (4, 4) from `start` (4, 4) by the distances of nearest points within `reach_m`."""
-    method = open3d().pipelines.registration.TransformationEstimationPointToPoint()
-    return _icp(source, target, reach_m, start, method, iterations=100)
+    registration = open3d().pipelines.registration
+    method = registration.TransformationEstimationPointToPoint()
+    criteria = registration.ICPConvergenceCriteria(_SETTLED_SHARE, _SETTLED_SHARE, 100)
+    found = registration.registration_icp(source, target, reach_m, start, method, criteria)
+    return np.array(found.transformation)
 
 
 def overlap(source: np.ndarray, target: Tree, reach_m: float, target_from_source: np.ndarray) -> float:
@@ -94,10 +97,3 @@ def reproducible(motion: np.ndarray) -> np.ndarray:
     bytes.
     """
     return pose.exp(np.round(pose.log(motion), _REPRODUCIBLE_DECIMALS))
-
-
-def _icp(source, target, reach_m: float, start: np.ndarray, method, iterations: int) -> np.ndarray:
-    registration = open3d().pipelines.registration
-    criteria = registration.ICPConvergenceCriteria(_SETTLED, _SETTLED, iterations)
-    found = registration.registration_icp(source, target, reach_m, start, method, criteria)
-    return np.array(found.transformation)
