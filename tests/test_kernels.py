@@ -50,6 +50,15 @@ def check_voxels(count: int) -> None:
     np.testing.assert_array_equal(grid.first_per_voxel(points, 0.7), expected)
 
 
+def check_means(count: int) -> None:
+    points = rng(3).uniform(-3, 3, (count, 3))
+    members: dict[tuple, list[int]] = {}
+    for row, point in enumerate(points):
+        members.setdefault(tuple(np.floor((point - points.min(axis=0)) / 0.7 + 0.5)), []).append(row)
+    expected = [points[rows].mean(axis=0) for rows in members.values()]
+    np.testing.assert_allclose(grid.means(points, 0.7), expected, atol=1e-12)
+
+
 def check_grid_queries(count: int) -> None:
     random = rng(1)
     points = random.uniform(-2, 2, (count, 3))
@@ -352,6 +361,7 @@ def check_tangent_stars(count: int) -> None:
 def check_all_tiny() -> None:
     """Every comparison on tiny inputs, for interpreted kernels."""
     check_voxels(60)
+    check_means(60)
     check_grid_queries(40)
     check_eigen(2)
     check_plane_eigen(2)
@@ -368,6 +378,11 @@ def check_all_tiny() -> None:
 def test_first_per_voxel():
     check_voxels(2000)
     assert len(grid.first_per_voxel(np.empty((0, 3)), 0.1)) == 0
+
+
+def test_means_per_voxel():
+    check_means(2000)
+    assert grid.means(np.empty((0, 3)), 0.1).shape == (0, 3)
 
 
 def test_grid_queries_see_every_neighbour_once():

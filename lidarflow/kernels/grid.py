@@ -35,6 +35,34 @@ def voxels(points: np.ndarray, voxel_m: float) -> tuple[np.ndarray, np.ndarray]:
     return numbered(np.ascontiguousarray(points), float(voxel_m))
 
 
+def means(points: np.ndarray, voxel_m: float) -> np.ndarray:
+    """The mean (V, 3) of the points (N, 3) in each occupied voxel, in the order voxels first appear.
+
+    The lowest point along each axis is in the middle of a voxel.
+    """
+    return _means(np.ascontiguousarray(points), float(voxel_m))
+
+
+@njit()
+def _means(points, voxel_m):
+    lower, placed = np.full(3, np.inf), np.empty_like(points)
+    for i in range(len(points)):
+        for k in range(3):
+            lower[k] = min(lower[k], points[i, k])
+    for i in range(len(points)):
+        for k in range(3):
+            placed[i, k] = points[i, k] - (lower[k] - 0.5 * voxel_m)
+    number, counts = numbered(placed, voxel_m)
+    total = np.zeros((len(counts), 3))
+    for i in range(len(points)):
+        for k in range(3):
+            total[number[i], k] += points[i, k]
+    for voxel in range(len(counts)):
+        for k in range(3):
+            total[voxel, k] /= counts[voxel]
+    return total
+
+
 @njit()
 def numbered(points, voxel_m):
     """As `voxels`, for other kernels."""

@@ -46,21 +46,18 @@ def register(
     little in common.
     """
     voxel_m = voxel_for(source, config.voxel_m)
-    fine = _thinned(source, voxel_m), Planes.of(_thinned(target, voxel_m), voxel_m)
+    fine = thinned(source, voxel_m), Planes.of(thinned(target, voxel_m), voxel_m)
     target_from_source = start
     if start is None:
         coarse_m = _COARSE_VOXELS * voxel_m
-        coarse = _thinned(source, coarse_m), Planes.of(_thinned(target, coarse_m), coarse_m)
-        target_from_source = robust_point_to_plane(*coarse, _STAGES_VOXELS[0] * voxel_m, np.eye(4))
+        coarse = thinned(source, coarse_m), Planes.of(thinned(target, coarse_m), coarse_m)
+        target_from_source = robust_point_to_plane(
+            *coarse, [_STAGES_VOXELS[0] * voxel_m], np.eye(4))
     reaches_m = [reach_voxels * voxel_m for reach_voxels in _STAGES_VOXELS[1:]]
-    for reach_m in [reach_m for reach_m in reaches_m if reach_m <= start_off_m] or reaches_m[-1:]:
-        target_from_source = robust_point_to_plane(*fine, reach_m, target_from_source)
+    reaches_m = [reach_m for reach_m in reaches_m if reach_m <= start_off_m] or reaches_m[-1:]
+    target_from_source = robust_point_to_plane(*fine, reaches_m, target_from_source)
     _require_overlap(*fine, _STAGES_VOXELS[2] * voxel_m, target_from_source)
     return target_from_source
-
-
-def _thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
-    return np.asarray(thinned(points, voxel_m).points)
 
 
 def _require_overlap(

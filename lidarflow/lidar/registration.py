@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.errors import DataError
-from lidarflow.kernels import neighbours, normals, tree
+from lidarflow.kernels import grid, neighbours, normals, tree
 from lidarflow.kernels import registration as kernel
 from lidarflow.kernels.tree import Tree
 from lidarflow.open3d_import import open3d
@@ -15,8 +15,10 @@ _SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range
 _NORMAL_RADIUS_VOXELS = 3.5
 _MIN_POINTS = 30
 _SETTLED = 1e-5              # a step that stays below it, in metres and radians, ends a registration
+_NEARLY_SETTLED = 1e-3       # and that ends a stage another one follows
 _SETTLED_SHARE = 1e-7        # relative change of fit and residual that ends a point-to-point ICP
 _MOST_ROUNDS = 30
+_OVERLAP_SAMPLE = 2000       # points; they tell a share to 0.02
 _HOLD = 1e-9
 _REPRODUCIBLE_DECIMALS = 9
 
@@ -27,17 +29,15 @@ def voxel_for(points: np.ndarray, wanted_m: float) -> float:
     return min(wanted_m, _SCENE_VOXEL_SHARE * scene_m)
 
 
-def thinned(points: np.ndarray, voxel_m: float):
-    """Open3D cloud of points (N, 3), averaged per voxel; DataError where too few are left."""
-    o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud = cloud.voxel_down_sample(voxel_m) if voxel_m > 0 else cloud
-    if len(cloud.points) < _MIN_POINTS:
+def thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
+    """Points (N, 3) averaged per voxel (M, 3); DataError where too few are left."""
+    found = grid.means(points, voxel_m) if voxel_m > 0 else points
+    if len(found) < _MIN_POINTS:
         raise DataError(
-            f"registration: a scan has {len(points)} points in range, {len(cloud.points)} after thinning to "
+            f"registration: a scan has {len(points)} points in range, {len(found)} after thinning to "
             f"{voxel_m:.2g} m, and registration needs {_MIN_POINTS}; is the scan complete and in metres, is "
             "preparation.min_range_m too large for the place?")
-    return cloud
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,39 +55,44 @@ class Planes:
 
 
 def robust_point_to_plane(
-    source: np.ndarray, target: Planes, reach_m: float, start: np.ndarray
+    source: np.ndarray, target: Planes, reaches_m: list[float], start: np.ndarray
 ) -> np.ndarray:
     """target_from_source (4, 4) of points (N, 3) from `start` (4, 4), by Gauss-Newton steps.
 
-    Tukey's loss, `reach_m` wide, lets moving objects go.
+    Tukey's loss lets moving objects go. It is as wide as one reach after the other, the widest first.
     """
     motion, pairs = start, kernel.Pairs(len(source))
-    for _ in range(_MOST_ROUNDS):
-        matrix, right, count = kernel.normal_equations(
-            source, motion, target.tree, target.normals, reach_m, pairs)
-        if count < _MIN_POINTS:
-            break
-        # What no plane holds, as in a corridor, is left where it is.
-        step = np.linalg.solve(matrix + _HOLD * np.trace(matrix) * np.eye(6), right)
-        motion = pose.exp(step) @ motion
-        if np.abs(step).max() < _SETTLED:
-            break
+    for reach_m in reaches_m:
+        settled = _SETTLED if reach_m == reaches_m[-1] else _NEARLY_SETTLED
+        for _ in range(_MOST_ROUNDS):
+            matrix, right, count = kernel.normal_equations(
+                source, motion, target.tree, target.normals, reach_m, pairs)
+            if count < _MIN_POINTS:
+                break
+            # What no plane holds, as in a corridor, is left where it is.
+            step = np.linalg.solve(matrix + _HOLD * np.trace(matrix) * np.eye(6), right)
+            motion = pose.exp(step) @ motion
+            if np.abs(step).max() < settled:
+                break
     return motion
 
 
 def point_to_point(source, target, reach_m: float, start: np.ndarray) -> np.ndarray:
-    """target_from_source (4, 4) from `start` (4, 4) by the distances of nearest points within `reach_m`."""
-    registration = open3d().pipelines.registration
+    """target_from_source (4, 4) of points (N, 3) from `start` (4, 4), by nearest points within `reach_m`."""
+    o3d = open3d()
+    registration = o3d.pipelines.registration
     method = registration.TransformationEstimationPointToPoint()
     criteria = registration.ICPConvergenceCriteria(_SETTLED_SHARE, _SETTLED_SHARE, 100)
-    found = registration.registration_icp(source, target, reach_m, start, method, criteria)
+    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)]
+    found = registration.registration_icp(*clouds, reach_m, start, method, criteria)
     return np.array(found.transformation)
 
 
 def overlap(source: np.ndarray, target: Tree, reach_m: float, target_from_source: np.ndarray) -> float:
-    """Share of the source (N, 3) that comes within `reach_m` of the target."""
-    distance_m, _ = neighbours.query(target, pose.apply(target_from_source, source), reach_m)
-    return float(np.isfinite(distance_m).mean())
+    """Share of the source (N, 3) that comes within `reach_m` of the target, by a sample."""
+    sample = source[::max(len(source) // _OVERLAP_SAMPLE, 1)]
+    return float(neighbours.any_within(
+        target, pose.apply(target_from_source, sample), np.full(len(sample), reach_m)).mean())
 
 
 def reproducible(motion: np.ndarray) -> np.ndarray:
