@@ -34,6 +34,7 @@ def _estimate(points, surface, keys, lower, shape, radius_m):
 def _estimate_some(points, surface, keys, lower, shape, radius_m, normals):
     starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
     values, across = np.empty(3), np.empty(3)
+    offsets = np.empty((0, 3))
     last, run_count = (0, 0, 0), 0
     for i in range(len(points)):
         # Points that follow one another are often in one cell.
@@ -41,31 +42,45 @@ def _estimate_some(points, surface, keys, lower, shape, radius_m, normals):
         if i == 0 or cell != last:
             last = cell
             run_count = grid.runs_around(cell, keys, shape, starts, ends)
-        _fit(points[i], surface, radius_m * radius_m, starts, ends, run_count, values, across, normals[i])
+            room = 1
+            for run in range(run_count):
+                room += ends[run] - starts[run]
+            if room > len(offsets):
+                offsets = np.empty((2 * room, 3))
+        count = _gather(points[i], surface, radius_m * radius_m, starts, ends, run_count, offsets)
+        if count >= _MIN_NEIGHBOURS:
+            _fit(points[i], offsets, count, values, across, normals[i])
 
 
 @njit()
-def _fit(p, surface, radius_sq, starts, ends, run_count, values, across, normal):
-    """Fill `normal` (3,) at p (3,) from the runs of the surface around it, if it has one."""
+def _gather(p, surface, radius_sq, starts, ends, run_count, offsets):
+    """How many of the surface are within the radius of p (3,); fills their offsets (·, 3) from it."""
+    px, py, pz = p[0], p[1], p[2]
     count = 0
-    sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
     for run in range(run_count):
         for j in range(starts[run], ends[run]):
-            x, y, z = surface[j, 0] - p[0], surface[j, 1] - p[1], surface[j, 2] - p[2]
-            if x * x + y * y + z * z > radius_sq:
-                continue
-            count += 1
-            sx += x
-            sy += y
-            sz += z
-            sxx += x * x
-            sxy += x * y
-            sxz += x * z
-            syy += y * y
-            syz += y * z
-            szz += z * z
-    if count < _MIN_NEIGHBOURS:
-        return
+            x, y, z = surface[j, 0] - px, surface[j, 1] - py, surface[j, 2] - pz
+            # Written anyway, and overwritten by the next where it is too far: branches take longer.
+            offsets[count, 0], offsets[count, 1], offsets[count, 2] = x, y, z
+            count += 1 if x * x + y * y + z * z <= radius_sq else 0
+    return count
+
+
+@njit()
+def _fit(p, offsets, count, values, across, normal):
+    """Fill `normal` (3,) at p (3,) from the offsets (·, 3) of its neighbours, if it has one."""
+    sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
+    for k in range(count):
+        x, y, z = offsets[k, 0], offsets[k, 1], offsets[k, 2]
+        sx += x
+        sy += y
+        sz += z
+        sxx += x * x
+        sxy += x * y
+        sxz += x * z
+        syy += y * y
+        syz += y * z
+        szz += z * z
     mx, my, mz = sx / count, sy / count, sz / count
     plane_eigen3(sxx / count - mx * mx, sxy / count - mx * my, sxz / count - mx * mz,
                  syy / count - my * my, syz / count - my * mz, szz / count - mz * mz, values, across)
