@@ -27,7 +27,8 @@ def prepared(cloud: Path, config: Config) -> tuple[np.ndarray, np.ndarray, np.nd
     """Non-ground points (N, 3) as float32 values, their normals (N, 3), and keypoint rows (K,)."""
     points = read_points(cloud)
     usable = preparation.usable(points, config.preparation)
-    points = points[usable & ~ground.detect(points, usable, config.ground)].astype(np.float32).astype(float)
+    upright = usable & ~ground.detect(points, usable, config.ground).mask
+    points = points[upright].astype(np.float32).astype(float)
     return (points, normals.estimate(points, points, config.normals.radius_m),
             grid.first_per_voxel(points, 2 * config.matching.keypoint_voxel_m))
 

@@ -42,7 +42,7 @@ def street():
 
 def assert_found(points: np.ndarray, from_floor_m: np.ndarray, from_things_m: np.ndarray) -> None:
     kept = preparation.usable(points, PreparationConfig(max_range_m=50.0))
-    found = ground.detect(points, kept, CONFIG)
+    found = ground.detect(points, kept, CONFIG).mask
     assert found.dtype == bool and not found[~kept].any()
     is_floor = kept & (from_floor_m < 0.1) & (from_things_m > 0.2)
     is_thing = kept & (from_floor_m > 0.2)
@@ -91,7 +91,7 @@ def test_flat_ground_is_found_from_any_height(height_m, is_origin_on_ground):
     height_over_ground = points[:, 2] + height_m
     if is_origin_on_ground:
         points = points + [0, 0, height_m]
-    found = ground.detect(points, np.ones(len(points), bool), CONFIG)
+    found = ground.detect(points, np.ones(len(points), bool), CONFIG).mask
     is_floor, is_thing = height_over_ground < 0.06, height_over_ground > 0.5
     assert found[is_floor].mean() > 0.95
     assert is_floor.sum() > 5000 and is_thing.sum() > 500
@@ -101,8 +101,8 @@ def test_flat_ground_is_found_from_any_height(height_m, is_origin_on_ground):
 def test_a_given_height_is_used_instead_of_the_estimate():
     points = yard(1.73)
     kept = np.ones(len(points), bool)
-    by_estimate = ground.detect(points, kept, CONFIG)
-    assert (ground.detect(points, kept, GroundConfig(sensor_height_m=1.73)) == by_estimate).mean() > 0.99
+    by_estimate = ground.detect(points, kept, CONFIG).mask
+    assert (ground.detect(points, kept, GroundConfig(sensor_height_m=1.73)).mask == by_estimate).mean() > 0.99
 
 
 def test_clouds_too_small_or_too_far_have_no_ground():
@@ -112,7 +112,7 @@ def test_clouds_too_small_or_too_far_have_no_ground():
     for points, rows in ((flat, kept), (flat[:0], kept[:0]), (flat[:3], np.ones(3, bool)),
                          (np.full((1000, 3), np.nan), np.zeros(1000, bool)),
                          (flat + [200.0, 0, 0], np.ones(1000, bool))):
-        found = ground.detect(points, rows, CONFIG)
+        found = ground.detect(points, rows, CONFIG).mask
         assert found.shape == (len(points),) and not found.any()
     assert ground.estimate_sensor_height(np.empty((0, 3))) is None
     assert ground.estimate_sensor_height(flat + [200.0, 0, 0]) is None

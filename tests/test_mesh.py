@@ -313,7 +313,7 @@ def test_a_sampled_surface_becomes_one_two_sided_sheet(sample):
 def test_most_of_a_real_scan_lies_in_components_worth_solving(name):
     points = open_dataset(SHARED / name).scan(0).points
     usable = preparation.usable(points, CONFIG.preparation)
-    kept = usable & ~ground.detect(points, usable, CONFIG.ground)
+    kept = usable & ~ground.detect(points, usable, CONFIG.ground).mask
     found = built(points, kept)
     assert found.method == "grid"
     sizes = np.bincount(found.component[kept])

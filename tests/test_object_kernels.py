@@ -350,12 +350,27 @@ def check_registration_equations(count: int) -> None:
 def check_ground_level(count: int) -> None:
     ground, places = rng(40).uniform(-3, 3, (count, 3)), rng(41).uniform(-4, 4, (count, 3))
     for count_near, reach_m in ((1, np.inf), (8, 1.2), (5, 0.8)):
-        found = ground_level.around(*ground_level.flat_tree(ground), places, count_near, reach_m)
+        flat = ground_level.flat(ground)
+        found = ground_level.around(flat, places, count_near, reach_m)
         apart = cdist(places[:, :2], ground[:, :2])
         nearest = np.argsort(apart, axis=1)[:, :count_near]
         expected = np.median(ground[nearest, 2], axis=1)
         expected[np.sort(apart, axis=1)[:, count_near - 1] >= reach_m] = np.nan
         np.testing.assert_allclose(found, expected, rtol=1e-12)
+        close = np.abs(places[:, 2] - ground_level.around(flat, places, count_near, reach_m, 0.7)) <= 0.7
+        np.testing.assert_array_equal(close, np.abs(places[:, 2] - expected) <= 0.7)
+
+
+def check_low_per_cell(count: int) -> None:
+    points = rng(42).uniform(-3, 3, (count, 3))
+    for share in (0.0, 0.3):
+        low, counts, cell = ground_level.low_per_cell(points, 1.5, share)
+        assert counts.sum() == count
+        for number in range(len(counts)):
+            own = points[cell == number]
+            assert len(own) == counts[number]
+            assert len(np.unique(np.floor(own[:, :2] / 1.5), axis=0)) == 1
+            assert low[number] == np.sort(own[:, 2])[int(share * (len(own) - 1))]
 
 
 def check_all_tiny() -> None:
@@ -375,10 +390,15 @@ def check_all_tiny() -> None:
     check_solve_positive4(2)
     check_registration_equations(40)
     check_ground_level(60)
+    check_low_per_cell(40)
 
 
 def test_ground_level():
     check_ground_level(900)
+
+
+def test_low_per_cell():
+    check_low_per_cell(700)
 
 
 def test_registration_equations():

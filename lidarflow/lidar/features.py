@@ -49,8 +49,8 @@ class Features:
 def masks(scan: Scan, config: Config) -> Masks:
     """The points of `scan` that take part, and the ground among them."""
     usable = preparation.usable(scan.points, config.preparation)
-    on_ground = ground.detect(scan.points, usable, config.ground)
-    return Masks(usable & ~ground.reflections(scan.points, usable, on_ground), on_ground)
+    found = ground.detect(scan.points, usable, config.ground)
+    return Masks(usable & ~found.reflection, found.mask)
 
 
 def extract(scan: Scan, config: Config) -> Features:

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import sys
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,20 +22,48 @@ _FILL_NEIGHBOURS = 8
 _FILL_RADIUS_M = 2.0
 
 
-def detect(points: np.ndarray, kept: np.ndarray, config: GroundConfig) -> np.ndarray:
-    """Mask (N,) of the ground among the `kept` rows of points (N, 3), metres, z up, sensor frame."""
-    ground = np.zeros(len(points), bool)
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """The ground of a scan, and what it tells of other returns.
+
+    mask        (N,) bool   on the ground
+    reflection  (N,) bool   from clearly below it: no surface is there, the beam was mirrored by a car or a
+                            window, and the point moves with the mirror
+    """
+
+    mask: np.ndarray
+    reflection: np.ndarray
+
+    @classmethod
+    def none(cls, count: int) -> "Ground":
+        """No ground among `count` points."""
+        return cls(np.zeros(count, bool), np.zeros(count, bool))
+
+
+def detect(points: np.ndarray, kept: np.ndarray, config: GroundConfig) -> Ground:
+    """The ground among the `kept` rows of points (N, 3), metres, z up, sensor frame."""
     rows = np.flatnonzero(kept)
     if len(rows) < _MIN_CLOUD_POINTS:
-        return ground
+        return Ground.none(len(points))
     height_m = config.sensor_height_m or estimate_sensor_height(points[rows])
     if height_m is None:
-        return ground
+        return Ground.none(len(points))
     shifted = points[rows].astype(np.float32)
     shifted[:, 2] += height_m - _PATCHWORK_HEIGHT_M
     found = rows[_patchwork(shifted)]
-    ground[found] = _close_to_local_ground(points[found], config.max_height_m)
-    return _filled(points, rows, ground, config.fill_height_m)
+    found = found[_close_to_local_ground(points[found], config.max_height_m)]
+    ground = np.zeros(len(points), bool)
+    ground[found] = True
+    if len(found) == 0:
+        return Ground(ground, np.zeros(len(points), bool))
+    around = ground_level.flat(points[found])
+    others = rows[~ground[rows]]
+    ground[others] = _in_the_plane_around(points[others], around, config.fill_height_m)
+    reflection = np.zeros(len(points), bool)
+    low = rows[~ground[rows] & (points[rows, 2] < np.median(points[found, 2]) - _REFLECTION_DEPTH_M)]
+    level = ground_level.around(around, points[low], 1, np.inf)
+    reflection[low] = points[low, 2] < level - _REFLECTION_DEPTH_M
+    return Ground(ground, reflection)
 
 
 def estimate_sensor_height(points: np.ndarray) -> float | None:
@@ -44,26 +73,9 @@ def estimate_sensor_height(points: np.ndarray) -> float | None:
     those leaves out cells that only show walls.
     """
     near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR_M]
-    lowest, counts, _ = _low_per_cell(near, 0.0)
+    lowest, counts, _ = ground_level.low_per_cell(near, _CELL_M, 0.0)
     trusted = lowest[counts >= _MIN_CELL_POINTS]
     return float(-np.quantile(trusted, 0.25)) if len(trusted) else None
-
-
-def reflections(points: np.ndarray, kept: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """Mask (N,) of the `kept` points that lie clearly below the ground around them.
-
-    No surface is there: the beam was mirrored by a car or a window, and the point moves with the mirror.
-    """
-    below = np.zeros(len(points), bool)
-    if not ground.any():
-        return below
-    surface = points[ground]
-    low = np.flatnonzero(kept & ~ground)
-    low = low[points[low, 2] < np.median(surface[:, 2]) - _REFLECTION_DEPTH_M]
-    if len(low):
-        level = ground_level.around(*ground_level.flat_tree(surface), points[low], 1, np.inf)
-        below[low] = points[low, 2] < level - _REFLECTION_DEPTH_M
-    return below
 
 
 def _close_to_local_ground(points: np.ndarray, max_height_m: float) -> np.ndarray:
@@ -71,38 +83,19 @@ def _close_to_local_ground(points: np.ndarray, max_height_m: float) -> np.ndarra
 
     A low quantile, not the lowest point, which may be a reflection from under the road.
     """
-    low, _, cell = _low_per_cell(points, _LOW_SHARE)
+    low, _, cell = ground_level.low_per_cell(points, _CELL_M, _LOW_SHARE)
     slope_allowance_m = 0.1 * _CELL_M
     return points[:, 2] - low[cell] <= max_height_m + slope_allowance_m
 
 
-def _filled(points: np.ndarray, rows: np.ndarray, ground: np.ndarray, height_m: float) -> np.ndarray:
-    """`ground` with the other `rows` that lie within `height_m` of the ground around them.
+def _in_the_plane_around(points: np.ndarray, ground: ground_level.Flat, height_m: float) -> np.ndarray:
+    """Mask (N,) of the points that lie within `height_m` of the ground around them.
 
     Patchwork++ judges whole patches and now and then drops one in the middle of the road; its points lie on
     rings that travel with the sensor and would pass for a moving object.
     """
-    others = rows[~ground[rows]]
-    if not ground.any() or len(others) == 0:
-        return ground
-    surface = points[ground]
-    level = ground_level.around(
-        *ground_level.flat_tree(surface), points[others], _FILL_NEIGHBOURS, _FILL_RADIUS_M)
-    filled = ground.copy()
-    filled[others] = np.abs(points[others, 2] - level) <= height_m   # not where the level is NaN
-    return filled
-
-
-def _low_per_cell(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """z (C,) at `share` of the way up each cell (0: lowest), counts (C,), and cell (N,) of each point."""
-    columns = np.floor(points[:, :2] / _CELL_M).astype(np.int64)
-    columns -= columns.min(axis=0) if len(columns) else 0
-    stride = columns[:, 1].max() + 1 if len(columns) else 1
-    key = columns[:, 0] * stride + columns[:, 1]
-    _, cell, counts = np.unique(key, return_inverse=True, return_counts=True)
-    order = np.lexsort((points[:, 2], cell))
-    first = np.cumsum(counts) - counts
-    return points[order[first + (share * (counts - 1)).astype(int)], 2], counts, cell
+    level = ground_level.around(ground, points, _FILL_NEIGHBOURS, _FILL_RADIUS_M, height_m)
+    return np.abs(points[:, 2] - level) <= height_m   # not where the level is NaN
 
 
 def _patchwork(points: np.ndarray) -> np.ndarray:
