@@ -1,12 +1,13 @@
 """Two scans in, flow out: the method from start to end."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from lidarflow import pose
+from lidarflow.aside import Aside, there
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.lidar import (
@@ -102,18 +103,17 @@ class FlowEstimator:
         Scans without times are taken 0.1 s apart. Raises DataError for a scan that cannot be used; the next
         one starts anew from it.
         """
-        timed, scan = Stopwatch(), as_scan(scan)
-        with timed("ego-motion"):
-            guess = self._odometry.step(scan.points)
-        source = self._scan
-        self._scan = scan
+        scan = as_scan(scan)
+        source, self._scan = self._scan, scan
         if source is None:
+            self._odometry.step(scan.points)
             preparation.require_points(scan, self.config.preparation)
             return None
         # Forgotten first: after a scan that cannot be used, the next pair must not inherit an older one's.
         previous, self._previous = self._previous, None
         tracks = self.tracks if previous else Tracks(next_id=self.tracks.next_id)
-        prepared = prepare(ScanPair(source, scan), self.config, previous, guess, tracks, timed)
+        prepared = prepare(
+            ScanPair(source, scan), self.config, previous, lambda: self._odometry.step(scan.points), tracks)
         result, self.tracks = explain(prepared, self.config)
         self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh)
         return result
@@ -161,38 +161,48 @@ class Prepared:
 
 
 def prepare(
-    pair: ScanPair, config: Config, previous: Previous | None = None, ego_guess: np.ndarray | None = None,
-    tracks: Tracks | None = None, timed: Stopwatch | None = None,
+    pair: ScanPair, config: Config, previous: Previous | None = None,
+    ego_guess: Callable[[], np.ndarray | None] | None = None, tracks: Tracks | None = None,
 ) -> Prepared:
     """All of a pair that comes before objects and solver; raises DataError for scans that cannot be used.
 
-    `previous` is what the pair before left, `tracks` its objects; `ego_guess` is a start value (4, 4) for the
-    ego-motion, `timed` goes on measuring stages.
+    `previous` is what the pair before left, `tracks` its objects; `ego_guess`, called once, gives a start
+    value (4, 4) for the ego-motion. Stages run beside one another; each is timed by how long it is waited
+    for.
     """
-    timed = timed or Stopwatch()
-    for scan in (pair.source, pair.target):
-        preparation.require_points(scan, config.preparation)
-    points = pair.source.points
-    with timed("features"):
-        before = previous.target if previous else None
-        source = before if before is not None else features.extract(pair.source, config)
-        target = features.extract(pair.target, config)
-    with timed("ego-motion"):
-        ego_motion = ego.find(
-            points[source.usable], pair.target.points[target.usable], ego_guess, config.ego)
-    with timed("mesh"):
+    timed, points = Stopwatch(), pair.source.points
+    with Aside() as beside:
+        guess = beside.begin(ego_guess) if ego_guess else None
+        for scan in (pair.source, pair.target):
+            preparation.require_points(scan, config.preparation)
+        with timed("features"):
+            target = features.extract(pair.target, config, beside)
+            before = previous.target if previous else None
+            source = before if before is not None else features.extract(pair.source, config, beside)
         mesh_before = previous.target_mesh if previous else None
-        source_mesh = mesh_before if mesh_before is not None else _mesh(pair.source, source, config)
-        target_mesh = _mesh(pair.target, target, config) if config.refine.rounds else None
-    tracks, search = tracks or Tracks(), None
-    if config.objects.enabled:
-        with timed("evidence"):
-            search = attribution.search(source, target, ego_motion, tracks, config)
-    with timed("matching"):
-        # Where nothing may have moved, matches would say what ego-motion says already.
-        sought = search.near(_MATCHED_NEAR_M) if search else np.ones(len(points), bool)
-        start_motions = _start(points, sought, previous, ego_motion, config)
-        graph = frontend.build_problem(pair, source, target, source_mesh, start_motions, config, sought)
+        begun_mesh = there(mesh_before) if mesh_before else beside.begin(_mesh, pair.source, source, config)
+        begun_target_mesh = beside.begin(_mesh, pair.target, target, config) if config.refine.rounds else None
+        with timed("ego-motion"):
+            ego_motion = ego.find(
+                points[source.usable], pair.target.points[target.usable], guess.result() if guess else None,
+                config.ego)
+        tracks, search = tracks or Tracks(), None
+        if config.objects.enabled:
+            with timed("features"):
+                target.begun_cloud.result()
+            with timed("evidence"):
+                search = attribution.search(source, target, ego_motion, tracks, config)
+        with timed("features"):
+            keypoints = source.keypoints, target.keypoints
+        with timed("mesh"):
+            source_mesh = begun_mesh.result()
+        with timed("matching"):
+            # Where nothing may have moved, matches would say what ego-motion says already.
+            sought = search.near(_MATCHED_NEAR_M) if search else np.ones(len(points), bool)
+            start_motions = _start(points, sought, previous, ego_motion, config)
+            graph = frontend.build_problem(pair, *keypoints, source_mesh, start_motions, config, sought)
+        with timed("mesh"):
+            target_mesh = begun_target_mesh.result() if begun_target_mesh else None
     return Prepared(
         pair, source, target, ego_motion, source_mesh, target_mesh, tracks, search, graph, timed.seconds)
 

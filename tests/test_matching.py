@@ -18,10 +18,11 @@ DT_S = 0.1
 def errors_m(source: Scan, target: Scan, truth: Truth) -> np.ndarray:
     """How far each match, searched around the unmoved keypoint, is from the true place of its keypoint."""
     here, there = features.extract(source, CONFIG), features.extract(target, CONFIG)
-    targets = target.points[there.keypoint]
-    query, found = matching.match(source.points[here.keypoint], here.descriptors, targets, there.descriptors,
+    here, there = here.keypoints, there.keypoints
+    targets = target.points[there.row]
+    query, found = matching.match(source.points[here.row], here.descriptors, targets, there.descriptors,
                                   DT_S, CONFIG.matching)
-    rows = here.keypoint[query]
+    rows = here.row[query]
     known = truth.valid[rows]
     true_places = source.points[rows] + truth.flow[rows]
     return np.linalg.norm(targets[found] - true_places, axis=1)[known]

@@ -43,12 +43,15 @@ FOLDER = cache_folder(Path(__file__).parent, numba.config.CACHE_DIR)
 
 
 def njit(**options):
-    """numba.njit with `options`, cached in FOLDER; caches of other packages stay where they are."""
+    """numba.njit with `options`, cached in FOLDER and free of the interpreter lock.
+
+    Caches of other packages stay where they are.
+    """
 
     def compiled(function):
         elsewhere, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(FOLDER)
         try:
-            return numba.njit(cache=True, **options)(function)
+            return numba.njit(cache=True, nogil=True, **options)(function)
         finally:
             numba.config.CACHE_DIR = elsewhere
 

@@ -1,9 +1,11 @@
 """What one scan brings to any pair it is part of: masks, surface, keypoints, descriptors."""
 
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
 
+from lidarflow.aside import Aside, done
 from lidarflow.config import Config
 from lidarflow.kernels import grid, shot, tree
 from lidarflow.lidar import ground, preparation
@@ -24,21 +26,39 @@ class Masks:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Features:
-    """A prepared scan.
+class Keypoints:
+    """Points that can be told apart.
 
-    usable       (N,) bool          as in Masks
-    ground       (N,) bool
-    cloud        Cloud              these points: what stands upright, rows ascending, and the ground
-    keypoint     (K,) int64         rows of the scan
-    descriptors  (K, 352) float32   SHOT of each keypoint, unit norm
+    row          (K,) int64          of the scan
+    descriptors  (K, 352) float32    SHOT of each, unit norm
+    """
+
+    row: np.ndarray
+    descriptors: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """A prepared scan; what takes long may still be under way, and is waited for when it is asked for.
+
+    usable     (N,) bool   as in Masks
+    ground     (N,) bool
+    cloud      Cloud       these points: what stands upright, rows ascending, and the ground
+    keypoints  Keypoints
     """
 
     usable: np.ndarray
     ground: np.ndarray
-    cloud: Cloud
-    keypoint: np.ndarray
-    descriptors: np.ndarray
+    begun_cloud: "Future[Cloud]"
+    begun_keypoints: "Future[Keypoints]"
+
+    @property
+    def cloud(self) -> Cloud:
+        return self.begun_cloud.result()
+
+    @property
+    def keypoints(self) -> Keypoints:
+        return self.begun_keypoints.result()
 
     @property
     def surface(self) -> np.ndarray:
@@ -53,16 +73,30 @@ def masks(scan: Scan, config: Config) -> Masks:
     return Masks(usable & ~found.reflection, found.mask)
 
 
-def extract(scan: Scan, config: Config) -> Features:
-    """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid and their descriptors."""
+def extract(scan: Scan, config: Config, beside: Aside | None = None) -> Features:
+    """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid and their descriptors.
+
+    All but the masks is done `beside` the caller where there is such a thing.
+    """
+    begin = beside.begin if beside else done
     seen = masks(scan, config)
-    rows = np.flatnonzero(seen.usable & ~seen.ground)
-    upright = Surface.of(scan.points[rows], config.shot.surface_voxel_m, config.normals.radius_m)
-    ground_tree = tree.build(scan.points[seen.usable & seen.ground])
-    keypoint = rows[grid.first_per_voxel(upright.points, config.matching.keypoint_voxel_m)]
+    cloud = begin(_cloud, scan.points, seen, config)
+    return Features(seen.usable, seen.ground, cloud, begin(_keypoints, scan.points, seen, cloud, config))
+
+
+def _cloud(points: np.ndarray, seen: Masks, config: Config) -> Cloud:
+    upright = points[seen.usable & ~seen.ground]
+    return Cloud(
+        Surface.of(upright, config.shot.surface_voxel_m, config.normals.radius_m),
+        tree.build(points[seen.usable & seen.ground]))
+
+
+def _keypoints(points: np.ndarray, seen: Masks, cloud: "Future[Cloud]", config: Config) -> Keypoints:
+    upright = cloud.result().upright
+    row = np.flatnonzero(seen.usable & ~seen.ground)[
+        grid.first_per_voxel(upright.points, config.matching.keypoint_voxel_m)]
     descriptors, _ = shot.describe(
-        scan.points[keypoint], upright.points[upright.thinned], upright.normals[upright.thinned],
+        points[row], upright.points[upright.thinned], upright.normals[upright.thinned],
         config.shot.radius_m, config.shot.min_neighbours)
     described = np.isfinite(descriptors[:, 0])
-    return Features(
-        seen.usable, seen.ground, Cloud(upright, ground_tree), keypoint[described], descriptors[described])
+    return Keypoints(row[described], descriptors[described])

@@ -7,7 +7,7 @@ import numpy as np
 from lidarflow import pose
 from lidarflow.config import Config
 from lidarflow.lidar import matching
-from lidarflow.lidar.features import Features
+from lidarflow.lidar.features import Keypoints
 from lidarflow.lidar.mesh import Mesh
 from lidarflow.types import FlowProblem, ScanPair
 
@@ -27,7 +27,7 @@ class Graph:
 
 
 def build_problem(
-    pair: ScanPair, source: Features, target: Features, mesh: Mesh, start: np.ndarray, config: Config,
+    pair: ScanPair, source: Keypoints, target: Keypoints, mesh: Mesh, start: np.ndarray, config: Config,
     sought: np.ndarray,
 ) -> Graph:
     """Variables, matches and smoothness edges of one pair (Dewan et al. 2016, section III).
@@ -43,9 +43,9 @@ def build_problem(
 
     sits_here = np.zeros(len(variable), bool)
     sits_here[rows] = True
-    in_graph = (sits_here & sought)[source.keypoint]
-    keypoint = source.keypoint[in_graph]
-    target_points = pair.target.points[target.keypoint]
+    in_graph = (sits_here & sought)[source.row]
+    keypoint = source.row[in_graph]
+    target_points = pair.target.points[target.row]
     query, found = matching.match(
         pose.apply(start[keypoint], pair.source.points[keypoint]), source.descriptors[in_graph],
         target_points, target.descriptors, pair.dt_s, config.matching)

@@ -1,0 +1,52 @@
+"""Work beside the main thread is done in order, reports its failures, and is over when it is left."""
+
+import threading
+import time
+
+import numba
+import pytest
+
+from lidarflow.aside import Aside, done, there
+
+needs_two_threads = pytest.mark.skipif(
+    numba.config.NUMBA_NUM_THREADS < 2, reason="kernels have one thread here: nothing is done beside it")
+
+
+@needs_two_threads
+def test_work_is_done_in_order_in_another_thread_and_is_over_at_the_end():
+    seen = []
+
+    def work(number: int) -> str:
+        time.sleep(0.02 * (3 - number))
+        seen.append(number)
+        return threading.current_thread().name
+
+    with Aside() as beside:
+        begun = [beside.begin(work, number) for number in range(3)]
+    assert seen == [0, 1, 2]
+    assert all(one.done() for one in begun)
+    assert {one.result() for one in begun}.isdisjoint({threading.current_thread().name})
+
+
+def test_a_failure_is_raised_where_the_result_is_asked_for():
+    with Aside() as beside:
+        begun = beside.begin(int, "no number")
+        with pytest.raises(ValueError, match="no number"):
+            begun.result()
+        assert beside.begin(int, "7").result() == 7
+
+
+def test_with_one_thread_everything_is_done_at_once():
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        with Aside() as beside:
+            begun = beside.begin(threading.current_thread)
+            assert begun.done() and begun.result() is threading.current_thread()
+    finally:
+        numba.set_num_threads(before)
+
+
+def test_what_is_done_or_there_needs_no_waiting():
+    assert done(divmod, 7, 2).result() == (3, 1)
+    assert there(None).done() and there(None).result() is None
