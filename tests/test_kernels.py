@@ -324,6 +324,7 @@ def check_graphs(count: int) -> None:
             label[a] = label[b] = min(label[a], label[b])
     _, expected = np.unique(label, return_inverse=True)
     np.testing.assert_array_equal(graphs.components(few, count), expected)
+    np.testing.assert_array_equal(graphs.components(triangles, count), graphs.components(edges, count))
     assert len(graphs.sides(triangles[:0], 5)) == 0
     np.testing.assert_array_equal(graphs.components(edges[:0], 3), [0, 1, 2])
 

@@ -11,9 +11,9 @@ def sides(triangles: np.ndarray, count: int) -> np.ndarray:
     return _sides(np.ascontiguousarray(triangles), count)
 
 
-def components(edges: np.ndarray, count: int) -> np.ndarray:
-    """Component (count,) int32 of points joined by edges (E, 2), numbered by their first points."""
-    return _components(np.ascontiguousarray(edges), count)
+def components(joined: np.ndarray, count: int) -> np.ndarray:
+    """Component (count,) int32 of points joined by edges (E, 2) or triangles (E, 3), by their first points."""
+    return _components(np.ascontiguousarray(joined), count)
 
 
 @njit()
@@ -34,7 +34,7 @@ def _sides(triangles, count):
     edges, found = np.empty((len(upper), 2), np.int32), 0
     for i in range(count):
         own = upper[first[i]: first[i + 1]]
-        own.sort()
+        _sort(own)
         for k in range(len(own)):
             if k == 0 or own[k] != own[k - 1]:
                 edges[found, 0], edges[found, 1] = i, own[k]
@@ -43,8 +43,20 @@ def _sides(triangles, count):
 
 
 @njit()
-def _components(edges, count):
+def _sort(few):
+    """Sort a handful of numbers in place, by insertion."""
+    for k in range(1, len(few)):
+        number, at = few[k], k
+        while at > 0 and few[at - 1] > number:
+            few[at] = few[at - 1]
+            at -= 1
+        few[at] = number
+
+
+@njit()
+def _components(joined, count):
     parent = np.arange(count)
-    for e in range(len(edges)):
-        join(parent, edges[e, 0], edges[e, 1])
+    for e in range(len(joined)):
+        for k in range(1, joined.shape[1]):
+            join(parent, joined[e, 0], joined[e, k])
     return labels(parent).astype(np.int32)

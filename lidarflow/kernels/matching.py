@@ -18,9 +18,11 @@ def best_in_gate(
     (Q,) of the best and of the best candidate farther than `rival_radius_m` from it (inf without one).
     """
     order, keys, lower, shape = grid.build(candidates, gate_m)
+    # Queries of one place share their candidates, which stay at hand when they come one after the other.
+    by_place, *_ = grid.build(centres, gate_m)
     best, best_sq, rival_sq = _best_in_gate(
-        centres, descriptors, candidates[order], candidate_descriptors[order], keys, lower, shape, gate_m,
-        rival_radius_m)
+        centres, descriptors, by_place, candidates[order], candidate_descriptors[order], keys, lower, shape,
+        gate_m, rival_radius_m)
     found = best >= 0
     best[found] = order[best[found]]
     return best, best_sq, rival_sq
@@ -36,12 +38,14 @@ def _dot(a, b):
 
 @njit(parallel=True)
 def _best_in_gate(
-    centres, descriptors, candidates, candidate_descriptors, keys, lower, shape, gate_m, rival_radius_m
+    centres, descriptors, by_place, candidates, candidate_descriptors, keys, lower, shape, gate_m,
+    rival_radius_m
 ):
     n = len(centres)
     best = np.full(n, -1, np.int64)
     best_sq, rival_sq = np.full(n, np.inf), np.full(n, np.inf)
-    for i in numba.prange(n):
+    for visit in numba.prange(n):
+        i = by_place[visit]
         starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
         run_count = grid.runs(centres[i], keys, lower, shape, gate_m, starts, ends)
         room = 0

@@ -80,7 +80,7 @@ def _grid_triangles(
         triangles, _strips(points, azimuth, order[meshed[order]], ring, limits),
         _strips(points, azimuth, order[~meshed[order]], ring, limits)])
 
-    component = graphs.components(graphs.sides(triangles, len(points)), len(points))
+    component = graphs.components(triangles, len(points))
     is_fragment = np.bincount(component)[component] < _FRAGMENT_POINTS
     across = [
         _strips(points, azimuth, order[ring[order] % step == phase], ring // step, limits)
