@@ -1,6 +1,6 @@
 """Work beside the thread that asks for it: two cores are rarely both busy with one kernel after the other."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
 
@@ -44,3 +44,20 @@ def there(value: T) -> "Future[T]":
     known: Future[T] = Future()
     known.set_result(value)
     return known
+
+
+def ahead(items: Iterator[T]) -> Iterator[T]:
+    """`items`, the next of which is made while whoever asks uses the last.
+
+    What making one raises is raised where it would have come. With one thread for kernels nothing is made
+    before it is asked for.
+    """
+    if numba.get_num_threads() == 1:
+        yield from items
+        return
+    end = object()
+    with ThreadPoolExecutor(1, "lidarflow") as thread:
+        begun = thread.submit(next, items, end)
+        while (item := begun.result()) is not end:
+            begun = thread.submit(next, items, end)
+            yield item  # type: ignore[misc]

@@ -12,7 +12,7 @@ def sides(triangles: np.ndarray, count: int) -> np.ndarray:
 
 
 def components(joined: np.ndarray, count: int) -> np.ndarray:
-    """Component (count,) int32 of points joined by edges (E, 2) or triangles (E, 3), by their first points."""
+    """Component (count,) int32 of points in edges (E, 2) or triangles (E, 3), numbered by first points."""
     return _components(np.ascontiguousarray(joined), count)
 
 
