@@ -27,6 +27,7 @@ def progress(what: str, total: int):
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     on = console(sys.stderr)
+    on.quiet = not on.is_terminal     # before rich 14.3 a disabled bar ends with an empty line
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
                TimeElapsedColumn())
     bar = Progress(*columns, console=on, disable=not on.is_terminal)
