@@ -1,6 +1,12 @@
 """What all commands of the command line share: the console, a spinner, and the check for a viewer."""
 
 import sys
+from typing import Annotated
+
+import typer
+
+Resume = Annotated[bool, typer.Option(
+    "--resume", help="Go on with a run that was interrupted; the results are the same.")]
 
 
 def console(file):
