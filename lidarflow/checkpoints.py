@@ -1,12 +1,15 @@
 """What a run keeps of every finished pair until it is complete, so that resuming it makes no difference.
 
 A checkpoint is an .npz file with the whole answer of a pair in full accuracy and the tracks after it, bound
-to the pair's points by a digest. It is written aside like all results and holds plain arrays only.
+to the pair's points by a digest. It is written aside like all results and holds plain arrays only. What
+does not depend on the sensor serves rgbd_checkpoints.py too.
 """
 
+import contextlib
 import hashlib
 import json
 import shutil
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
@@ -28,7 +31,7 @@ _NAMES = ("digest", *_PLAIN, "flow", "motion_table", "motion_row", "object_ids",
           "track_counts", "track_points", "notes")
 
 
-class Checkpoints:
+class CheckpointFiles:
     """The checkpoints in a run folder, one per pair, by the index of its source scan."""
 
     def __init__(self, run_dir: Path):
@@ -38,21 +41,10 @@ class Checkpoints:
         """Indices of the pairs that are kept."""
         return frozenset(int(file.stem) for file in self.folder.glob("*.npz") if file.stem.isdigit())
 
-    def save(self, index: int, pair: ScanPair, result: FlowResult, tracks: Tracks) -> None:
-        """Keep the answer of the pair at `index`."""
-        self.put(index, packed(pair, result, tracks))
-
     def put(self, index: int, content: bytes) -> None:
-        """Keep what `packed` made of the pair at `index`."""
+        """Keep the bytes of the checkpoint of the pair at `index`."""
         with io.written_aside(self.file(index)) as aside:
             aside.write_bytes(content)
-
-    def load(self, index: int, pair: ScanPair) -> tuple[FlowResult, Tracks]:
-        """The answer of the pair at `index`, and the tracks after it.
-
-        Raises DataError where the file is damaged, or was made of other points than the pair's.
-        """
-        return unpacked(self.file(index), pair)
 
     def remove(self) -> None:
         """Let go of all of them: the run is complete, or begins anew."""
@@ -61,6 +53,21 @@ class Checkpoints:
     def file(self, index: int) -> Path:
         """Where the checkpoint of the pair at `index` is."""
         return self.folder / f"{index:06d}.npz"
+
+
+class Checkpoints(CheckpointFiles):
+    """The checkpoints of a LiDAR run."""
+
+    def save(self, index: int, pair: ScanPair, result: FlowResult, tracks: Tracks) -> None:
+        """Keep the answer of the pair at `index`."""
+        self.put(index, packed(pair, result, tracks))
+
+    def load(self, index: int, pair: ScanPair) -> tuple[FlowResult, Tracks]:
+        """The answer of the pair at `index`, and the tracks after it.
+
+        Raises DataError where the file is damaged, or was made of other points than the pair's.
+        """
+        return unpacked(self.file(index), pair)
 
 
 def packed(pair: ScanPair, result: FlowResult, tracks: Tracks) -> bytes:
@@ -89,11 +96,8 @@ def packed(pair: ScanPair, result: FlowResult, tracks: Tracks) -> bytes:
 
 def unpacked(file: Path, pair: ScanPair) -> tuple[FlowResult, Tracks]:
     """The answer and the tracks in a checkpoint file; DataError where it is damaged or of another pair."""
-    arrays = io.read_archive(file, _NAMES)
-    if str(arrays["digest"]) != _digest(pair):
-        raise DataError(f"{file}: was made of other points than those of scans {pair.source.name} and "
-                        f"{pair.target.name} now; the data changed, run again without --resume")
-    try:
+    arrays = read_bound(file, _NAMES, _digest(pair), (pair.source.name, pair.target.name))
+    with naming_damage(file):
         notes = json.loads(str(arrays["notes"]))
         check("motion_row", arrays["motion_row"], (len(pair.source),), "i")
         check("motion_table", arrays["motion_table"], (None, 4, 4), "f")
@@ -104,9 +108,37 @@ def unpacked(file: Path, pair: ScanPair) -> tuple[FlowResult, Tracks]:
             motions=motions, stats=SolveStats(**notes["stats"]), seconds=notes["seconds"],
             objects=_objects(arrays), **{name: arrays[name] for name in _PLAIN})
         return result, Tracks(_tracks(arrays), notes["next_id"])
+
+
+def read_bound(
+    file: Path, names: tuple[str, ...], digest: str, pair: tuple[str, str],
+) -> dict[str, np.ndarray]:
+    """The arrays of a checkpoint; DataError where it is damaged, or made of a pair with another digest."""
+    arrays = io.read_archive(file, names)
+    if str(arrays["digest"]) != digest:
+        raise DataError(f"{file}: was made of other data than {pair[0]} and {pair[1]} are now; the data "
+                        "changed, run again without --resume")
+    return arrays
+
+
+@contextlib.contextmanager
+def naming_damage(file: Path) -> Iterator[None]:
+    """DataError, which names the checkpoint, for what arrays that make no sense raise."""
+    try:
+        yield
     except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{file}: damaged ({reason}); delete it and resume again") from None
+
+
+def digest_of(parts: Iterable[tuple[str, np.ndarray | None]]) -> str:
+    """A digest of texts and the arrays that belong to them."""
+    digest = hashlib.blake2b(digest_size=16)
+    for text, array in parts:
+        digest.update(text.encode("utf-8", "surrogateescape"))
+        if array is not None:
+            digest.update(array.tobytes())
+    return digest.hexdigest()
 
 
 @dataclass(slots=True)
@@ -160,11 +192,8 @@ def _follows(source: Scan, result: FlowResult) -> bool:
 
 
 def _digest(pair: ScanPair) -> str:
-    digest = hashlib.blake2b(digest_size=16)
-    for scan in (pair.source, pair.target):
-        digest.update(f"{scan.name} {scan.time_ns} {len(scan)} ".encode("utf-8", "surrogateescape"))
-        digest.update(scan.points.tobytes())
-    return digest.hexdigest()
+    return digest_of((f"{scan.name} {scan.time_ns} {len(scan)} ", scan.points)
+                     for scan in (pair.source, pair.target))
 
 
 def _objects(arrays: dict[str, np.ndarray]) -> tuple[MovingObject, ...]:

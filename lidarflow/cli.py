@@ -15,6 +15,7 @@ from lidarflow.errors import LidarflowError
 from lidarflow.export_cli import export
 from lidarflow.rgbd_cli import app as rgbd_app
 from lidarflow.run_cli import Spread, pairs_done, process
+from lidarflow.terminal import Resume
 from lidarflow.terminal import announce_first_use as _announce_first_use
 from lidarflow.terminal import check_live_view as _check_live_view
 from lidarflow.terminal import show as _print
@@ -141,8 +142,7 @@ def run(
     visualize: Visualize = False,
     arrows: Arrows = False,
     record: Annotated[bool, typer.Option(help="Write recording.rrd (about 5 MB a pair).")] = True,
-    resume: Annotated[bool, typer.Option(
-        "--resume", help="Go on with a run that was interrupted; the results are the same.")] = False,
+    resume: Resume = False,
     skip_bad: Annotated[bool, typer.Option(
         "--skip-bad", help="Leave out scans that cannot be used, and say which.")] = False,
     workers: Annotated[int | None, typer.Option(

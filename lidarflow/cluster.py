@@ -24,7 +24,7 @@ from lidarflow.datasets import Dataset, Source, open_dataset
 from lidarflow.errors import DataError, InstallError, LidarflowError
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.pipeline import Estimator
-from lidarflow.stepping import Skipped, steps
+from lidarflow.stepping import Skipped, Walk, steps
 
 CHUNK_PAIRS = 20
 WARM_UP_PAIRS = 4      # an object that is missed is expected for three more
@@ -82,7 +82,7 @@ def explain_chunk(source: Source, chunk: Chunk, config: Config, method: str, ski
     found = []
     try:
         frames = list(range(chunk.begin, chunk.stop + 1))
-        for step in steps(dataset, frames, estimator, None, _ignored if skip_bad else None):
+        for step in steps(Walk.of_scans(dataset, estimator), frames, None, _ignored if skip_bad else None):
             found.append((step.index, packed(step.pair, step.result, step.tracks)))
     except LidarflowError as error:
         return Computed(tuple(found), " ".join(str(error).split()))

@@ -16,12 +16,14 @@ def export(
     out: Annotated[Path | None, typer.Option(
         "--out", help="Folder, or .txt file for poses; RUN_DIR-FORMAT if not given.")] = None,
     data: Annotated[Path | None, typer.Option(help="Where the run's data are now, if they moved.")] = None,
+    masks: Annotated[Path | None, typer.Option(
+        help="For av2-v1, the challenge's .zip of masks: write only what it counts.")] = None,
 ) -> None:
     """Write results in another program's format."""
     from lidarflow import export as exporting
 
     with working(f"{name} of {run_dir}"):
-        files = list(exporting.export(run_dir, name, out, data))
+        files = list(exporting.export(run_dir, name, out, data, masks))
     print(f"results    {run_dir}")
     print(f"format     {name}")
     for file in files[:1]:

@@ -2,12 +2,14 @@
 
 import itertools
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from lidarflow import io
 from lidarflow.datasets import Dataset, Source, open_dataset
+from lidarflow.datasets.rgbd_folders import RgbdSource
 from lidarflow.errors import DataError
+from lidarflow.rgbd_types import Camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +19,7 @@ class RunSource:
     skipped  those among them that could not be used
     """
 
-    dataset: Source | None
+    dataset: Source | RgbdSource | None
     scans: tuple[int, ...]
     skipped: tuple[int, ...] = ()
 
@@ -30,16 +32,28 @@ class RunSource:
 
 def write(run_dir: Path, source: RunSource) -> None:
     """Write source.json into a run folder."""
-    opened = source.dataset
-    described = {} if opened is None else {
-        "data": str(opened.folder), "loader": opened.loader, "sequence": opened.sequence,
-        "kitti_correction": opened.kitti_correction}
+    described = {}
+    match source.dataset:
+        case Source() as opened:
+            described = {"data": str(opened.folder), "loader": opened.loader, "sequence": opened.sequence,
+                         "kitti_correction": opened.kitti_correction}
+        case RgbdSource() as opened:
+            described = {"data": str(opened.folder), "camera": asdict(opened.camera),
+                         "depth_scale": opened.depth_scale}
     io.write_json(run_dir / io.SOURCE_FILE, {
         **described, "scans": source.scans, **({"skipped": source.skipped} if source.skipped else {})})
 
 
 def read(run_dir: Path) -> RunSource:
-    """What source.json in a run folder says; DataError where there is none, or it is damaged."""
+    """What source.json in a LiDAR run's folder says; DataError where there is none, or it is damaged."""
+    source = read_any(run_dir)
+    if isinstance(source.dataset, RgbdSource):
+        raise DataError(f"{run_dir}: is a run of RGB-D images; expected one of LiDAR scans")
+    return source
+
+
+def read_any(run_dir: Path) -> RunSource:
+    """As `read`, but of RGB-D images too."""
     file = run_dir / io.SOURCE_FILE
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
@@ -49,6 +63,9 @@ def read(run_dir: Path) -> RunSource:
         skipped = tuple(int(index) for index in values.get("skipped", ()))
         if "data" not in values:
             return RunSource(None, scans, skipped)
+        if "camera" in values:
+            camera, folder = Camera(**values["camera"]), Path(values["data"])
+            return RunSource(RgbdSource(folder, camera, float(values["depth_scale"])), scans, skipped)
         texts = values["data"], values["loader"], values["kitti_correction"]
         if not all(isinstance(text, str) for text in texts):
             raise ValueError("data, loader and kitti_correction must be texts")

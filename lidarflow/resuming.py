@@ -6,8 +6,10 @@ from pathlib import Path
 
 from lidarflow import io, provenance
 from lidarflow.config import Config, load, to_dict
+from lidarflow.datasets.rgbd_folders import RgbdSource
 from lidarflow.errors import DataError
 from lidarflow.provenance import RunSource
+from lidarflow.rgbd_config import RgbdConfig
 
 _NAMED = 3                     # how many settings a message shows
 _LAST_FILE = "timing.json"     # what a run writes last
@@ -29,7 +31,7 @@ class Plan:
     """
 
     source: RunSource
-    config: Config
+    config: Config | RgbdConfig
     method: str
     chunk: int = 0
 
@@ -67,14 +69,14 @@ def state_of(out: Path, plan: Plan) -> State:
 
 def _difference(out: Path, plan: Plan) -> str:
     """What a run in `out` was made of that `plan` does not ask for; "" for nothing."""
-    made_of = provenance.read(out)
+    made_of = provenance.read_any(out)
     if made_of.dataset != plan.source.dataset:
         return f"from {_place(made_of)}, not from {_place(plan.source)}"
     if made_of.scans != plan.source.scans:
         return f"from scans {_span(made_of.scans)}, not {_span(plan.source.scans)}"
     if (out / io.CONFIG_FILE).read_text(encoding="utf-8") == io.as_toml(plan.config, plan.comment):
         return ""
-    used, wanted = to_dict(load(out / io.CONFIG_FILE)), to_dict(plan.config)
+    used, wanted = to_dict(load(out / io.CONFIG_FILE, (), type(plan.config))), to_dict(plan.config)
     settings = [f"{section}.{name} = {value}, not {wanted[section][name]}"
                 for section, values in used.items() for name, value in values.items()
                 if value != wanted[section][name]]
@@ -88,6 +90,8 @@ def _place(source: RunSource) -> str:
     opened = source.dataset
     if opened is None:
         return "scans that are not in a folder"
+    if isinstance(opened, RgbdSource):
+        return f"{opened.folder} (RGB-D, {opened.camera}, depth scale {opened.depth_scale:g})"
     sequence = f", sequence {opened.sequence}" if opened.sequence is not None else ""
     return f"{opened.folder} ({opened.loader}{sequence}, kitti_correction {opened.kitti_correction})"
 

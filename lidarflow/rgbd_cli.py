@@ -3,18 +3,20 @@
 Heavy packages are imported inside the commands, so that --help answers at once.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidarflow.terminal import announce_first_use, check_live_view, progress, show, working
+from lidarflow.terminal import Resume, announce_first_use, check_live_view, progress, show, working
 
 if TYPE_CHECKING:
     from lidarflow.datasets.rgbd_folders import RgbdFolder
     from lidarflow.rgbd_config import RgbdConfig
     from lidarflow.rgbd_runner import RgbdReport
-    from lidarflow.runner import Viewing
+    from lidarflow.runner import Going, Viewing
+    from lidarflow.stepping import Skipped
 
 app = typer.Typer(
     help="Odometry and scene flow from RGB-D images.",
@@ -94,13 +96,16 @@ def run(
     method: Method = "ours",
     visualize: Visualize = False,
     record: Annotated[bool, typer.Option(help="Write recording.rrd (about 2 MB a pair).")] = True,
+    resume: Resume = False,
+    skip_bad: Annotated[bool, typer.Option(
+        "--skip-bad", help="Leave out frames that cannot be used, and say which.")] = False,
     config: ConfigFile = None,
     overrides: Overrides = None,
 ) -> None:
     """Odometry and scene flow along a sequence of RGB-D images."""
     from lidarflow import rgbd_methods
     from lidarflow.datasets.rgbd_folders import CameraChoice, open_rgbd
-    from lidarflow.runner import Viewing
+    from lidarflow.runner import Going, Viewing
 
     settings = _settings(config, overrides)
     rgbd_methods.check(method)
@@ -108,7 +113,8 @@ def run(
     print(f"reading    {data}: {len(folder)} frames")
     for note in folder.notes:
         print(f"note       {note}")
-    _process(folder, method, settings, out, Viewing(record, visualize), jump, n_frames)
+    _process(folder, method, settings, out, Viewing(record, visualize), jump, n_frames,
+             Going(resume, skip_bad))
 
 
 @app.command()
@@ -139,22 +145,29 @@ def show_config() -> None:
 
 
 def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Path, viewing: "Viewing",
-             jump: int = 0, n_frames: int | None = None) -> None:
+             jump: int = 0, n_frames: int | None = None, going: "Going | None" = None) -> None:
     """Run over a folder and say what was found."""
     from lidarflow import rgbd_runner, runner
     from lidarflow.rgbd_tables import run_notes, run_table
-    from lidarflow.tables import where_results_are
+    from lidarflow.tables import skipped_lines, where_results_are
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(folder, jump, n_frames, "frames")
+    skipped: list[Skipped] = []
+    going = replace(going or runner.Going(), on_skip=skipped.append)
+    if going.resume and runner.is_complete(folder, frames, settings, out, method, going):
+        print(f"complete   {out}: nothing is left to do")
+        return
     announce_first_use()
     with progress("frame pairs", len(frames) - 1) as bar:
 
         def on_pair(report: "RgbdReport") -> None:
             bar.update(0, advance=1, description=f"frame pairs, {report.frame} done")
 
-        done = rgbd_runner.process(folder, frames, method, settings, out, viewing, on_pair)
+        done = rgbd_runner.process(folder, frames, method, settings, out, viewing, on_pair, going)
     print()
+    for line in skipped_lines(skipped, len(frames), len(done.reports), "frame"):
+        print(line)
     show(run_table(done))
     print()
     for note in run_notes(done):

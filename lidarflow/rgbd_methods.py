@@ -17,9 +17,21 @@ _MAX_DEPTH_M = 10.0
 
 
 class Estimator(Protocol):
-    """Frames of one camera in, in order; the result of the last two out, None after the first."""
+    """Frames of one camera in, in order; the result of the last two out, None after the first.
 
-    def step(self, frame: RgbdFrame) -> RgbdResult | None: ...
+    tracks  None: no object has a number that goes from pair to pair
+    """
+
+    tracks: None
+
+    def step(self, frame: RgbdFrame) -> RgbdResult | None:
+        """The result of the last frame and this one; LidarflowError for a frame of no use."""
+
+    def follow(self, frame: RgbdFrame, known: RgbdResult, tracks: None = None) -> None:
+        """As `step` where its answer is known: the next step is the same."""
+
+    def reset(self) -> None:
+        """Begin anew with the next frame."""
 
 
 class Open3dOdometry:
@@ -28,9 +40,19 @@ class Open3dOdometry:
     Works at the size that our method works at, with Open3D's own settings but for the depth, up to 10 m.
     """
 
+    tracks: None = None
+
     def __init__(self, camera: Camera, config: RgbdConfig | None = None):
         self._camera, self._images = camera, (config or RgbdConfig()).images
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew with the next frame."""
         self._last: RgbdFrame | None = None
+
+    def follow(self, frame: RgbdFrame, known: RgbdResult, tracks: None = None) -> None:
+        """As `step` where its answer is known: the next step is the same."""
+        self._last, _ = pyramid.at_working_size(frame, self._camera, self._images)
 
     def step(self, frame: RgbdFrame) -> RgbdResult | None:
         """Result of the pair of the last frame and this one; SolveError where Open3D finds no motion."""

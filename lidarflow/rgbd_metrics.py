@@ -153,18 +153,23 @@ class Drift:
     per_second_deg: float
 
 
-def drift(estimated: np.ndarray, true: np.ndarray, times_ns: np.ndarray) -> Drift:
+def drift(estimated: np.ndarray, true: np.ndarray, times_ns: np.ndarray, stretch: np.ndarray | None = None
+          ) -> Drift:
     """Relative pose error of poses (N, 4, 4), world_from_camera, against true ones; NaN poses do not count.
+
+    Poses of different stretches (N,), if given, are not compared: what lies between them was left out.
 
     E_ij = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j) with P estimated and Q true (Sturm et al. 2012); j is the next frame, or
     the one a second later, by at most half the usual step between frames.
     """
     times_s = np.asarray(times_ns) * 1e-9
-    first = np.arange(len(times_s) - 1)
+    stretch = np.zeros(len(times_s)) if stretch is None else stretch
+    first = np.flatnonzero(stretch[:-1] == stretch[1:])
     a_frame = _pose_errors(estimated, true, first, first + 1)
     later = np.abs(times_s[:, None] - (times_s + PER_S)).argmin(axis=0) if len(times_s) else first
-    half_step_s = 0.5 * np.median(np.diff(times_s)) if len(first) else 0.0
+    half_step_s = 0.5 * np.median(np.diff(times_s)) if len(times_s) > 1 else 0.0
     hit = np.abs(times_s[later] - times_s - PER_S) <= half_step_s if len(times_s) else np.empty(0, bool)
+    hit &= stretch[later] == stretch if len(times_s) else hit
     a_second = _pose_errors(estimated, true, np.flatnonzero(hit), later[hit])
     return Drift(len(a_frame[0]), *(_rms(errors) for errors in (*a_frame, *a_second)))
 

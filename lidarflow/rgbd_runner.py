@@ -1,20 +1,22 @@
 """A whole run over RGB-D frames: a folder of images in, a folder of results out."""
 
-import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, metrics, pose, rgbd_io, rgbd_methods, rgbd_metrics, rgbd_preview
+from lidarflow import io, metrics, pose, provenance, rgbd_io, rgbd_methods, rgbd_metrics, rgbd_preview
 from lidarflow.datasets.rgbd_folders import RgbdFolder
-from lidarflow.errors import LidarflowError
+from lidarflow.resuming import Plan
+from lidarflow.rgbd_checkpoints import RgbdCheckpoints
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_metrics import DepthStatistics, Drift, RgbdScores, WarpScores
 from lidarflow.rgbd_types import RgbdPair, RgbdResult, RgbdTruth
-from lidarflow.runner import Viewing, recording
+from lidarflow.runner import Going, Viewing, begun_steps, plain_skipped, plan_of, recording
+from lidarflow.stepping import Step, Walk
+from lidarflow.trajectory import Trajectory
 
 OUTPUT_STAGE = "scores and output"
 
@@ -50,47 +52,60 @@ class RgbdRun:
 
 def process(
     folder: RgbdFolder, frames: list[int], method: str, config: RgbdConfig, out: Path, viewing: Viewing,
-    on_pair: Callable[[RgbdReport], None] = lambda report: None,
+    on_pair: Callable[[RgbdReport], None] = lambda report: None, going: Going | None = None,
 ) -> RgbdRun:
     """Process `frames` of a folder and write a run folder; `on_pair` hears of every finished pair.
 
-    Flow files are complete as soon as they appear; poses, metrics, recording and picture follow. Raises
-    LidarflowError for input or output that cannot be used.
+    Flow files are complete as soon as they appear; poses, metrics, recording and picture follow. Until then
+    every pair is kept as a checkpoint too, from which `going.resume` goes on. Raises LidarflowError for input
+    or output that cannot be used.
     """
-    # The first pair is done before the folder is touched: bad data leaves no empty run behind.
-    io.check_run_folder(out)
-    reports: list[RgbdReport] = []
-    results = _results(folder, frames, rgbd_methods.estimator(method, folder.camera, config), reports, out)
-    first = next(results)
-    io.new_run_folder(out)
-    io.write_toml(out / io.CONFIG_FILE, config)
-    poses, times_ns = [np.eye(4)], []
-    given = folder.world_from_camera()
+    going = going or Going()
+    plan, kept = plan_of(folder, frames, config, method, going), RgbdCheckpoints(out)
+    walk = Walk.of_frames(folder, rgbd_methods.estimator(method, folder.camera, config))
+    done, skipped = begun_steps(walk, plan, kept, out, going)
+    reports, way = [], Trajectory(frames)
     with recording(out / io.RECORDING_FILE, viewing, _open_recording) as stream:
-        for index, (pair, result) in zip(frames, itertools.chain([first], results), strict=False):
-            begin = time.perf_counter()
-            report = report_pair(pair, result, folder.truth(index), given, index)
-            rgbd_io.save_flow(out / io.FLOW_FOLDER / f"{pair.source.name}.npz", pair.source, result, config,
-                              stats_of(method, report))
-            if stream is not None:
-                from lidarflow import rgbd_viewer
-
-                rgbd_viewer.log_pair(stream, index, pair, result, report.residuals, poses[-1])
-            poses.append(poses[-1] @ pose.inverse(result.odometry))
-            times_ns.append(pair.source.time_ns)
-            with_output = {**report.seconds, OUTPUT_STAGE: time.perf_counter() - begin}
-            reports.append(replace(report, seconds=with_output))
+        for step in done:
+            reports.append(_write_pair(folder, step, plan, out, stream, way))
+            if not step.restored:
+                kept.save(step.index, step.pair, step.result)
             on_pair(reports[-1])
-    poses, times_ns = np.stack(poses), [*times_ns, pair.target.time_ns]
-    drift = None if given is None else rgbd_metrics.drift(poses, given[frames], np.array(times_ns))
-    run = RgbdRun(method, tuple(reports), drift)
-    io.write_poses_tum(out / "poses_tum.txt", poses, times_ns)
+    run = RgbdRun(method, tuple(reports), _drift_along(way, folder.world_from_camera()))
+    way.write_tum(out)
     with io.written_aside(out / "preview.png") as aside:
-        rgbd_preview.write_preview(aside, pair.source, result)
-    io.write_json(out / "metrics.json", metrics_of(run))
+        rgbd_preview.write_preview(aside, step.pair.source, step.result)
+    provenance.write(out, replace(plan.source, skipped=tuple(frame.index for frame in skipped)))
+    io.write_json(out / io.METRICS_FILE, {**metrics_of(run), **plain_skipped(skipped)})
     io.write_json(out / "timing.json", {report.frame: report.seconds for report in reports})
+    kept.remove()
     io.link_latest(out)
     return run
+
+
+def _write_pair(folder: RgbdFolder, step: Step, plan: Plan, out: Path, stream, way: Trajectory) -> RgbdReport:
+    """Write the flow file of a pair, log it, lengthen the way by it, and report it."""
+    begin, pair, result = time.perf_counter(), step.pair, step.result
+    report = report_pair(pair, result, folder.truth(step.index), folder.world_from_camera(), step.index)
+    file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
+    if not (step.restored and file.is_file()):     # a checkpoint is younger than its flow file
+        rgbd_io.save_flow(file, pair.source, result, plan.config, stats_of(plan.method, report))
+    world_from_source = way.reached(step.index)
+    if stream is not None:
+        from lidarflow import rgbd_viewer
+
+        rgbd_viewer.log_pair(stream, step.index, pair, result, report.residuals, world_from_source)
+    way.add(step.index, pair, result.odometry)
+    return replace(report, seconds={**report.seconds, OUTPUT_STAGE: time.perf_counter() - begin})
+
+
+def _drift_along(way: Trajectory, given: np.ndarray | None) -> Drift | None:
+    """The drift of a way against given poses (N, 4, 4), not over frames that were left out; None without."""
+    if given is None:
+        return None
+    indices, poses, times_ns = way.timed()
+    stretch = np.cumsum(np.diff(indices, prepend=indices[0]) > 1)
+    return rgbd_metrics.drift(poses, given[indices], np.array(times_ns), stretch)
 
 
 def report_pair(pair: RgbdPair, result: RgbdResult, truth: RgbdTruth | None = None,
@@ -144,22 +159,6 @@ def figures_of(report: RgbdReport) -> dict[str, float]:
     if report.drift is not None:
         figures |= {"drift_m": report.drift.per_frame_m, "drift_deg": report.drift.per_frame_deg}
     return figures | ({} if report.scores is None else asdict(report.scores))
-
-
-def _results(folder: RgbdFolder, frames: list[int], estimator: rgbd_methods.Estimator,
-             reports: list[RgbdReport], out: Path) -> Iterator[tuple[RgbdPair, RgbdResult]]:
-    """Pairs and results; an error on the way also says at which frame, and what is kept of the run."""
-    source = None
-    for index in frames:
-        try:
-            target = folder.frame(index)
-            result = estimator.step(target)
-        except LidarflowError as error:
-            kept = f"; the flow of {len(reports)} before is kept in {out / io.FLOW_FOLDER}" if reports else ""
-            raise type(error)(f"{error} (frame {index} of {folder.name}{kept})") from error
-        if result is not None:
-            yield RgbdPair(source, target, folder.camera), result
-        source = target
 
 
 def _open_recording(path: Path | None, spawn: bool):

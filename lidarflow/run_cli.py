@@ -51,7 +51,7 @@ def process(
 ) -> None:
     """Run over a data set and say what was found."""
     from lidarflow import runner
-    from lidarflow.tables import run_notes, run_table, where_results_are
+    from lidarflow.tables import run_notes, run_table, skipped_lines, where_results_are
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(dataset, jump, n_scans)
@@ -67,10 +67,8 @@ def process(
         reports = runner.process(
             dataset, frames, settings, out, viewing, lambda report: on_pair(report.frame), method, going)
     print()
-    for scan in skipped:
-        print(f"skipped    scan {scan.index}: {scan.reason}")
-    if skipped:
-        print(f"skipped    {len(skipped)} of {len(frames)} scans; {len(reports)} pairs are left\n")
+    for line in skipped_lines(skipped, len(frames), len(reports)):
+        print(line)
     show(run_table(reports, settings))
     print()
     for note in run_notes(reports, settings):

@@ -4,9 +4,10 @@ import contextlib
 import itertools
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +18,13 @@ from lidarflow.datasets import Dataset
 from lidarflow.errors import DataError
 from lidarflow.provenance import RunSource
 from lidarflow.resuming import Plan, State, state_of
-from lidarflow.stepping import Skipped, Step, saying_what_is_kept, steps
+from lidarflow.stepping import Kept, Skipped, Step, Walk, saying_what_is_kept, steps
 from lidarflow.trajectory import Trajectory
 from lidarflow.types import FlowResult, Scan, ScanPair, SolveStats, Truth
+
+if TYPE_CHECKING:
+    from lidarflow.datasets.rgbd_folders import RgbdFolder
+    from lidarflow.rgbd_config import RgbdConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,26 +105,12 @@ def process(
     `going.resume` goes on. Raises LidarflowError for input or output that cannot be used.
     """
     going = going or Going()
-    skipped: list[Skipped] = []
-    # The first pair is done before the folder is touched: a bad data set leaves no empty run behind.
-    io.check_run_folder(out)
-    plan = Plan(RunSource(dataset.source, tuple(frames)), config, method, going.chunk)
-    begun = going.resume and state_of(out, plan) is State.BEGUN
-    kept = Checkpoints(out)
-    done = saying_what_is_kept(
-        steps(dataset, frames, methods.find(method).along(config), kept if begun else None,
-              _heard(going, skipped) if going.skip_bad else None), out)
-    first = next(done, None)
-    if first is None:
-        raise DataError(f"{dataset.name}: no two neighbouring scans can be used; the first that cannot: "
-                        f"{skipped[0].reason}")
-    if begun:
-        io.remove_left_overs(out)
-    else:
-        resuming.begin(out, plan)
+    plan, kept = plan_of(dataset, frames, config, method, going), Checkpoints(out)
+    walk = Walk.of_scans(dataset, methods.find(method).along(config))
+    done, skipped = begun_steps(walk, plan, kept, out, going)
     reports, way, objects = [], Trajectory(frames), []
     with recording(out / io.RECORDING_FILE, viewing, _open_recording) as stream:
-        for step in itertools.chain([first], done):
+        for step in done:
             reports.append(_write_pair(dataset, step, config, out, stream, way, viewing.arrows))
             if not step.restored:
                 kept.save(step.index, step.pair, step.result, step.tracks)
@@ -130,28 +121,62 @@ def process(
     with io.written_aside(out / "preview.png") as aside:
         preview.write_preview(aside, step.pair, step.result)
     provenance.write(out, replace(plan.source, skipped=tuple(scan.index for scan in skipped)))
-    io.write_json(out / io.METRICS_FILE, {**metrics_of(reports, config), **_plain_skipped(skipped)})
+    io.write_json(out / io.METRICS_FILE, {**metrics_of(reports, config), **plain_skipped(skipped)})
     io.write_json(out / "timing.json", {r.frame: r.seconds for r in reports})
     kept.remove()
     io.link_latest(out)
     return reports
 
 
+def plan_of(data: "Dataset | RgbdFolder", frames: list[int], config: "Config | RgbdConfig", method: str,
+            going: Going) -> Plan:
+    """What decides the bytes of a run."""
+    return Plan(RunSource(data.source, tuple(frames)), config, method, going.chunk)
+
+
+def begun_steps(walk: Walk, plan: Plan, kept: Kept, out: Path, going: Going
+                ) -> tuple[Iterator[Step], list[Skipped]]:
+    """The pairs of a run, whose folder `out` is ready for results, and the scans that are left out.
+
+    Those come to the list as the pairs are gone through. The first pair is done before the folder is touched:
+    bad data leave no empty run behind. Raises LidarflowError where nothing can be used or `out` holds
+    another run.
+    """
+    skipped: list[Skipped] = []
+
+    def on_skip(scan: Skipped) -> None:
+        skipped.append(scan)
+        going.on_skip(scan)
+
+    io.check_run_folder(out)
+    begun = going.resume and state_of(out, plan) is State.BEGUN
+    found = steps(walk, list(plan.source.scans), kept if begun else None, on_skip if going.skip_bad else None)
+    done = saying_what_is_kept(found, out)
+    first = next(done, None)
+    if first is None:
+        raise DataError(f"{walk.name}: no two neighbouring {walk.what} can be used; the first that cannot: "
+                        f"{skipped[0].reason}")
+    if begun:
+        io.remove_left_overs(out)
+    else:
+        resuming.begin(out, plan)
+    return itertools.chain([first], done), skipped
+
+
 def begin(dataset: Dataset, frames: list[int], config: Config, out: Path, method: str, going: Going
           ) -> Checkpoints:
     """Make `out` ready for checkpoints that others compute; those of an interrupted run stay."""
     io.check_run_folder(out)
-    plan = Plan(RunSource(dataset.source, tuple(frames)), config, method, going.chunk)
+    plan = plan_of(dataset, frames, config, method, going)
     if not (going.resume and state_of(out, plan) is State.BEGUN):
         resuming.begin(out, plan)
     return Checkpoints(out)
 
 
-def is_complete(dataset: Dataset, frames: list[int], config: Config, out: Path, method: str,
-                going: Going) -> bool:
-    """Whether `out` holds all that `process` would write; DataError where it holds another run."""
-    plan = Plan(RunSource(dataset.source, tuple(frames)), config, method, going.chunk)
-    return state_of(out, plan) is State.COMPLETE
+def is_complete(data: "Dataset | RgbdFolder", frames: list[int], config: "Config | RgbdConfig", out: Path,
+                method: str, going: Going) -> bool:
+    """Whether `out` holds all that this run would write; DataError where it holds another run."""
+    return state_of(out, plan_of(data, frames, config, method, going)) is State.COMPLETE
 
 
 def _write_pair(
@@ -174,16 +199,8 @@ def _write_pair(
         **report.seconds, "scores and output": time.perf_counter() - begin})
 
 
-def _heard(going: Going, skipped: list[Skipped]) -> Callable[[Skipped], None]:
-    """What takes down a scan that is left out, and says it."""
-    def on_skip(scan: Skipped) -> None:
-        skipped.append(scan)
-        going.on_skip(scan)
-
-    return on_skip
-
-
-def _plain_skipped(skipped: list[Skipped]) -> dict:
+def plain_skipped(skipped: list[Skipped]) -> dict:
+    """What metrics.json says of scans that were left out; nothing where there are none."""
     return {"skipped": [{"scan": scan.index, "reason": scan.reason} for scan in skipped]} if skipped else {}
 
 

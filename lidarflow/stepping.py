@@ -1,16 +1,25 @@
-"""The pairs of a sequence, one after the other: computed, or taken from what an interrupted run kept."""
+"""The pairs of a sequence, one after the other: computed, or taken from what an interrupted run kept.
+
+Scans and RGB-D frames are gone through alike; a `Walk` says what they are.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 from lidarflow import io
-from lidarflow.checkpoints import Checkpoints
 from lidarflow.datasets import Dataset
 from lidarflow.errors import LidarflowError
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.pipeline import Estimator
+from lidarflow.rgbd_types import RgbdFrame, RgbdPair, RgbdResult
 from lidarflow.types import FlowResult, Scan, ScanPair
+
+if TYPE_CHECKING:
+    from lidarflow.datasets.rgbd_folders import RgbdFolder
+    from lidarflow.rgbd_methods import Estimator as RgbdEstimator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,15 +27,52 @@ class Step:
     """A finished pair.
 
     index     int   of its source scan in the data set; its target is the next
-    tracks          the objects that are followed after it
+    tracks          the objects that are followed after it; None for RGB-D frames
     restored  bool  taken from a checkpoint
     """
 
     index: int
-    pair: ScanPair
-    result: FlowResult
-    tracks: Tracks
+    pair: ScanPair | RgbdPair
+    result: FlowResult | RgbdResult
+    tracks: Tracks | None
     restored: bool
+
+
+class Kept(Protocol):
+    """Checkpoints: of which pairs there are, and the answer of one and the tracks after it."""
+
+    def found(self) -> frozenset[int]: ...
+
+    def load(self, index: int, pair: ScanPair | RgbdPair) -> tuple[
+        FlowResult | RgbdResult, Tracks | None]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """What is gone through: a sequence, and who explains it.
+
+    name       str   what messages call the sequence
+    what       str   "scans" or "frames"
+    read             the scan at an index; LidarflowError where it cannot be used
+    pair             two of them, one after the other
+    estimator        is shown them one by one
+    """
+
+    name: str
+    what: str
+    read: Callable[[int], Scan | RgbdFrame]
+    pair: Callable[..., ScanPair | RgbdPair]
+    estimator: "Estimator | RgbdEstimator"
+
+    @classmethod
+    def of_scans(cls, dataset: Dataset, estimator: Estimator) -> "Walk":
+        """Along the scans of a data set."""
+        return cls(dataset.name, "scans", dataset.scan, ScanPair, estimator)
+
+    @classmethod
+    def of_frames(cls, folder: "RgbdFolder", estimator: "RgbdEstimator") -> "Walk":
+        """Along the RGB-D frames of a folder."""
+        return cls(folder.name, "frames", folder.frame, partial(RgbdPair, camera=folder.camera), estimator)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +84,9 @@ class Skipped:
 
 
 def steps(
-    dataset: Dataset, frames: list[int], estimator: Estimator, kept: Checkpoints | None = None,
-    on_skip: Callable[[Skipped], None] | None = None,
+    walk: Walk, frames: list[int], kept: Kept | None = None, on_skip: Callable[[Skipped], None] | None = None,
 ) -> Iterator[Step]:
-    """Every pair of neighbouring scans among `frames`, in order.
+    """Every pair of neighbouring scans, or frames, among `frames`, in order.
 
     Pairs that are `kept` are not computed again. The estimator is led past them, so that what follows comes
     out as if they had been computed; behind the last missing pair it is not needed any more.
@@ -51,27 +96,28 @@ def steps(
     """
     restorable = kept.found() if kept is not None else frozenset()
     missing = [index for index in frames[:-1] if index not in restorable]
-    source: Scan | None = None
+    estimator, source = walk.estimator, None
     for frame in frames:
         is_known = source is not None and frame - 1 in restorable
         try:
-            target = dataset.scan(frame)
+            target = walk.read(frame)
             result = None if is_known else estimator.step(target)
         except LidarflowError as error:
             if on_skip is None:
                 first = max(frame - 1, frames[0])
-                raise type(error)(f"{error} (scans {first} and {first + 1} of {dataset.name})") from error
+                raise type(error)(f"{error} ({walk.what} {first} and {first + 1} of {walk.name})") from error
             on_skip(Skipped(frame, " ".join(str(error).split())))
             estimator.reset()
             source = None
             continue
         if is_known:
-            result, tracks = kept.load(frame - 1, ScanPair(source, target))
+            pair = walk.pair(source, target)
+            result, tracks = kept.load(frame - 1, pair)
             if missing and missing[-1] >= frame:
                 estimator.follow(target, result, tracks)
-            yield Step(frame - 1, ScanPair(source, target), result, tracks, True)
+            yield Step(frame - 1, pair, result, tracks, True)
         elif source is not None:
-            yield Step(frame - 1, ScanPair(source, target), result, estimator.tracks, False)
+            yield Step(frame - 1, walk.pair(source, target), result, estimator.tracks, False)
         source = target
 
 
@@ -86,4 +132,4 @@ def saying_what_is_kept(done: Iterator[Step], out: Path) -> Iterator[Step]:
         if not count:
             raise
         raise type(error)(f"{error}; the flow of {count} before is kept in {out / io.FLOW_FOLDER}, "
-                          "--resume goes on from there and --skip-bad leaves bad scans out") from error
+                          "--resume goes on from there and --skip-bad leaves bad ones out") from error

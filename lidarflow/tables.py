@@ -11,6 +11,7 @@ from lidarflow.compare import Comparison
 from lidarflow.config import Config, describe
 from lidarflow.metrics import Alignment
 from lidarflow.runner import PairReport, figures_of, mean_of, truth_of
+from lidarflow.stepping import Skipped
 from lidarflow.types import FlowResult, ScanPair
 
 _COLUMNS = {
@@ -150,6 +151,14 @@ def pair_table(pair: ScanPair, result: FlowResult, alignment: Alignment) -> Tabl
         table.add_row("note", doubt)
     table.add_row("seconds", ", ".join(f"{stage} {s:.1f}" for stage, s in result.seconds.items()))
     return table
+
+
+def skipped_lines(skipped: list[Skipped], count: int, pairs: int, what: str = "scan") -> list[str]:
+    """What is said of scans that were left out of `count`, with `pairs` left; nothing where none are."""
+    if not skipped:
+        return []
+    return [*(f"skipped    {what} {left_out.index}: {left_out.reason}" for left_out in skipped),
+            f"skipped    {len(skipped)} of {count} {what}s; {pairs} pairs are left\n"]
 
 
 def where_results_are(out: Path, is_recorded: bool) -> list[str]:

@@ -1,6 +1,12 @@
 """What all commands of the command line share: the console, a spinner, and the check for a viewer."""
 
 import sys
+from typing import Annotated
+
+import typer
+
+Resume = Annotated[bool, typer.Option(
+    "--resume", help="Go on with a run that was interrupted; the results are the same.")]
 
 
 def console(file):
@@ -27,6 +33,7 @@ def progress(what: str, total: int):
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     on = console(sys.stderr)
+    on.quiet = not on.is_terminal     # before rich 14.3 a disabled bar ends with an empty line
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
                TimeElapsedColumn())
     bar = Progress(*columns, console=on, disable=not on.is_terminal)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow import io, pose
+from lidarflow.rgbd_types import RgbdPair
 from lidarflow.types import ScanPair
 
 
@@ -27,17 +28,24 @@ class Trajectory:
             self._poses.append(self._poses[-1] @ self._step)
         return self._poses[index - self._first]
 
-    def add(self, index: int, pair: ScanPair, ego_motion: np.ndarray) -> None:
+    def add(self, index: int, pair: ScanPair | RgbdPair, ego_motion: np.ndarray) -> None:
         """Go from the scan `index` to the next by its ego_motion (4, 4), target_from_source."""
         world_from_source, self._step = self.reached(index), pose.inverse(ego_motion)
         self._poses.append(world_from_source @ self._step)
         self._times_ns |= {index: pair.source.time_ns, index + 1: pair.target.time_ns}
 
-    def write(self, out: Path) -> None:
-        """Write poses_kitti.txt, a row for every scan, and poses_tum.txt, without scans of unknown time."""
-        self.reached(self._first + self._count - 1)
+    def timed(self) -> tuple[list[int], np.ndarray, list[int]]:
+        """Indices (K,), poses (K, 4, 4) and times of the scans whose time is known, those of the pairs."""
         timed = sorted(self._times_ns)
-        poses = np.stack(self._poses)
-        io.write_poses_kitti(out / "poses_kitti.txt", poses)
-        io.write_poses_tum(out / "poses_tum.txt", poses[[index - self._first for index in timed]],
-                           [self._times_ns[index] for index in timed])
+        return timed, np.stack([self.reached(index) for index in timed]), [self._times_ns[k] for k in timed]
+
+    def write_tum(self, out: Path) -> None:
+        """Write poses_tum.txt, without scans of unknown time."""
+        _, poses, times_ns = self.timed()
+        io.write_poses_tum(out / "poses_tum.txt", poses, times_ns)
+
+    def write(self, out: Path) -> None:
+        """Write poses_kitti.txt, a row for every scan, and poses_tum.txt."""
+        self.reached(self._first + self._count - 1)
+        io.write_poses_kitti(out / "poses_kitti.txt", np.stack(self._poses))
+        self.write_tum(out)

@@ -22,7 +22,7 @@ from lidarflow.config import Config
 from lidarflow.datasets import open_dataset
 from lidarflow.methods import METHODS
 from lidarflow.runner import Going, Viewing, process
-from lidarflow.stepping import steps
+from lidarflow.stepping import Walk, steps
 
 SCANS = 9
 QUIET = Viewing(record=False)
@@ -177,7 +177,7 @@ def test_chunks_hold_every_pair_once(first, last, pairs):
 def test_objects_keep_their_numbers_across_chunks(street, tmp_path):
     """The second chunk has numbers of its own: 10 + n, those it shares with the first in another order."""
     kept, data = Checkpoints(tmp_path), open_dataset(street)
-    whole = list(steps(data, [0, 1, 2, 3, 4], METHODS["ours"].along(Config())))
+    whole = list(steps(Walk.of_scans(data, METHODS["ours"].along(Config())), [0, 1, 2, 3, 4]))
     for step in whole:
         kept.save(step.index, step.pair, step.result, step.tracks)
     chunks = [Chunk(0, 0, 0, 2), Chunk(0, 0, 2, 4)]
@@ -219,7 +219,7 @@ def test_chunks_differ_little_where_the_warm_up_does_not_reach_the_start(tmp_pat
     kept = Checkpoints(tmp_path)
     for index, content in computed.checkpoints:
         kept.put(index, content)
-    for step in steps(dataset, frames[20:], METHODS["ours"].along(Config()), kept):
+    for step in steps(Walk.of_scans(dataset, METHODS["ours"].along(Config())), frames[20:], kept):
         one_go = io.load_flow(tmp_path / "run" / "flow" / f"{step.pair.source.name}.npz")
         apart_m = np.linalg.norm(one_go.flow - step.result.flow, axis=1)
         assert step.restored and np.nanquantile(apart_m, 0.9) < 1e-3

@@ -3,7 +3,6 @@
 import pickle
 import shutil
 import sys
-import zipfile
 
 import numpy as np
 import pytest
@@ -93,33 +92,6 @@ def test_points_that_are_not_known_are_not_valid(run, tmp_path):
     names, columns = table(second)
     assert not columns["is_valid"][0] and columns["is_valid"][1:].all()
     assert all(np.isnan(columns[name][0]) for name in names[1:])
-
-
-def test_the_official_package_takes_our_files(log_run, tmp_path):
-    archive = pytest.importorskip("av2.evaluation.scene_flow.make_submission_archive")
-    evaluation = pytest.importorskip("av2.evaluation.scene_flow.eval")
-    import pandas as pd
-    out, masks, truth = tmp_path / "sub", tmp_path / "masks.zip", tmp_path / "truth" / LOG
-    files = list(export.export(log_run, "av2-v1", out))
-    truth.mkdir(parents=True)
-    with zipfile.ZipFile(masks, "w") as packed:
-        for file, found in zip(files, flows(log_run), strict=True):
-            n = len(found.points)
-            everywhere = pd.DataFrame({"mask": np.ones(n, bool)})
-            everywhere.to_feather(tmp_path / "mask.feather")
-            packed.write(tmp_path / "mask.feather", f"{LOG}/{file.name}")
-            # One centimetre off along x: the mean error that the package must find.
-            flow = found.flow.astype(np.float64) + (0.01, 0.0, 0.0)
-            pd.DataFrame({
-                "category_indices": np.zeros(n, np.uint8), "is_dynamic": found.is_dynamic,
-                "is_valid": np.ones(n, bool), "is_close": np.ones(n, bool),
-                **dict(zip(FLOW_COLUMNS, flow.T.astype(np.float32), strict=True))}
-            ).to_feather(truth / file.name)
-    archive.validate(out, masks)
-    scores = evaluation.evaluate(str(tmp_path / "truth"), str(out))
-    errors = {name: value for name, value in scores.items() if name.startswith("EPE") and np.isfinite(value)}
-    assert errors and all(abs(value - 0.01) < 0.002 for value in errors.values()), scores
-    assert scores["Dynamic IoU"] == 1.0
 
 
 # OpenSceneFlow.

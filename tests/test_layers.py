@@ -20,7 +20,7 @@ LAYERS = [
     {"methods"},
     {"metrics", "rgbd_metrics", "io", "viewer", "preview", "rgbd_preview"},
     {"provenance", "rgbd_io", "checkpoints", "trajectory"},
-    {"rgbd_viewer", "resuming", "stepping"},
+    {"rgbd_viewer", "rgbd_checkpoints", "resuming", "stepping"},
     {"runner", "cluster"},
     {"rgbd_runner"},
     {"evaluation", "compare", "export"},

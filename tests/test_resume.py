@@ -20,7 +20,7 @@ from lidarflow.datasets import open_dataset
 from lidarflow.errors import DataError
 from lidarflow.methods import METHODS
 from lidarflow.runner import Going, Viewing, process
-from lidarflow.stepping import steps
+from lidarflow.stepping import Walk, steps
 
 QUIET = Viewing(record=False)
 SCANS = 5
@@ -78,7 +78,7 @@ def test_pairs_that_are_kept_are_not_computed_again(street, unbroken, tmp_path, 
     assert was_killed(killed) and sorted(Checkpoints(out).found()) == [0, 1, 2]
     computed = []
     estimator = METHODS["ours"].along(Config())
-    for step in steps(open_dataset(street), list(range(SCANS)), estimator, Checkpoints(out)):
+    for step in steps(Walk.of_scans(open_dataset(street), estimator), list(range(SCANS)), Checkpoints(out)):
         computed += [] if step.restored else [step.index]
     assert computed == [3]
     process(open_dataset(street), list(range(SCANS)), Config(), out, QUIET, going=Going(resume=True))
@@ -180,7 +180,7 @@ def test_a_complete_run_has_nothing_left_to_do(street, tmp_path, lidarflow):
 def test_a_checkpoint_comes_back_to_the_last_bit(street, tmp_path):
     for method in METHODS:
         estimator, kept = METHODS[method].along(Config()), Checkpoints(tmp_path / method)
-        for step in steps(open_dataset(street), [0, 1, 2], estimator):
+        for step in steps(Walk.of_scans(open_dataset(street), estimator), [0, 1, 2]):
             kept.save(step.index, step.pair, step.result, step.tracks)
             result, tracks = kept.load(step.index, step.pair)
             assert packed(step.pair, result, tracks) == packed(step.pair, step.result, step.tracks)
@@ -196,7 +196,7 @@ def test_a_checkpoint_comes_back_to_the_last_bit(street, tmp_path):
 
 def test_a_damaged_checkpoint_is_named(street, tmp_path):
     kept = Checkpoints(tmp_path)
-    step = next(steps(open_dataset(street), [0, 1], METHODS["zero"].along(Config())))
+    step = next(steps(Walk.of_scans(open_dataset(street), METHODS["zero"].along(Config())), [0, 1]))
     kept.save(0, step.pair, step.result, step.tracks)
     file, = kept.folder.iterdir()
     file.write_bytes(file.read_bytes()[:-30])

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -125,19 +126,25 @@ class Argoverse2(ScanFiles):
 
 def read_columns(file: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Columns of a .feather table by name; DataError where it is damaged or lacks one."""
+    return columns_of(file, str(file), names)
+
+
+def columns_of(content: Path | BinaryIO, place: str, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """`read_columns` of a file or of one that is open; `place` is what messages call it."""
     try:
         from pyarrow import ArrowException, feather
     except ImportError:
-        raise InstallError(f"{file}: .feather needs the package pyarrow; pip install pyarrow") from None
+        raise InstallError(f"{place}: .feather needs the package pyarrow; pip install pyarrow") from None
     try:
-        table = feather.read_table(file, memory_map=False)
+        table = feather.read_table(content, memory_map=False)
         table.validate(full=True)     # pyarrow reads past its buffers where offsets lie
         missing = [name for name in names if name not in table.column_names]
         if not missing:
             return {name: table.column(name).to_numpy() for name in names}
     except (ArrowException, OSError, ValueError, MemoryError) as error:
-        raise DataError(f"{file}: not a readable .feather table ({clouds.one_line(error)})") from None
-    raise DataError(f"{file}: lacks the columns {', '.join(missing)}; it has {', '.join(table.column_names)}")
+        raise DataError(f"{place}: not a readable .feather table ({clouds.one_line(error)})") from None
+    held = ", ".join(table.column_names)
+    raise DataError(f"{place}: lacks the columns {', '.join(missing)}; it has {held}")
 
 
 def log_folders(folder: Path) -> dict[str, Path]:

@@ -55,9 +55,14 @@ def from_npz(path: Path, names: Sequence[str] = ()) -> dict[str, np.ndarray]:
         return {name: _member(archive, held[name]) for name in names or held}
 
 
-def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+def check_unpacked(info: zipfile.ZipInfo) -> None:
+    """Raise ValueError where a member of an archive announces more bytes than its own can unpack to."""
     if info.file_size > _MOST_UNPACKED * info.compress_size + _MOST_UNPACKED:
         raise ValueError(f"{info.filename} says that {info.compress_size} bytes unpack to {info.file_size}")
+
+
+def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    check_unpacked(info)
     with archive.open(info) as member:
         shape, by_column, dtype = _header(member, info.filename)
         _check_size(info.filename, shape, dtype, info.file_size - member.tell(), exactly=True)

@@ -54,6 +54,15 @@ class _Listing:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class RgbdSource:
+    """What RGB-D frames are made of: a folder, the camera, and depth in metres = pixel / depth_scale."""
+
+    folder: Path
+    camera: Camera
+    depth_scale: float
+
+
 class RgbdFolder:
     """A sequence of RGB-D frames from the files of a folder.
 
@@ -61,11 +70,13 @@ class RgbdFolder:
     layout  "tum" or "images"
     notes   what was assumed while opening it
     camera  Camera
+    source  RgbdSource
     """
 
     def __init__(self, folder: Path, listing: _Listing, camera: Camera, origin: str):
         self.name = f"{listing.layout} {folder_name(folder)}"
         self.layout, self.camera = listing.layout, camera
+        self.source = RgbdSource(folder.resolve(), camera, float(listing.depth_scale))
         self._folder, self._files = folder, listing
         self._poses, pose_notes = _poses(listing)
         self.notes = (f"camera: {origin}", f"depth in metres is pixel/{listing.depth_scale:g}",

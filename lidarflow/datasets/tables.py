@@ -1,7 +1,7 @@
 """Small text files that lie beside scans: times and poses."""
 
 from collections.abc import Sequence
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +77,7 @@ def date_to_ns(text: str, path: Path) -> int:
     """Time in ns since 1970 of a date and time of day with up to nine decimals, taken as UTC."""
     whole, _, decimals = text.partition(".")
     try:
-        seconds = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc).timestamp()
+        seconds = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC).timestamp()
         return round(seconds) * 1_000_000_000 + int(decimals[:9].ljust(9, "0"))
     except ValueError:
         raise DataError(f"{path}: expected a time like 2011-09-26 13:02:25.95, got '{text[:40]}'") from None

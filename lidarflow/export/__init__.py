@@ -1,9 +1,11 @@
 """Results in the formats of others: a module for each family of formats, and all of them in FORMATS.
 
-A format is a function of (FinishedRun, out) that yields the files it has written.
+A format is a function of (FinishedRun, out) that yields the files it has written; those of MASKED_FORMATS
+take an archive of masks too.
 """
 
 import difflib
+import functools
 import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,18 +25,27 @@ FORMATS = {
     "tum": "lidarflow.export.poses:write_tum",
 }
 POSE_FORMATS = ("kitti", "kitti-camera", "tum")     # one text file; all others fill a folder
+MASKED_FORMATS = ("av2-v1",)                       # what may be limited to the points that a challenge counts
 
 
-def export(run_dir: Path, name: str, out: Path | None = None, data: Path | None = None) -> Iterator[Path]:
+def export(
+    run_dir: Path, name: str, out: Path | None = None, data: Path | None = None, masks: Path | None = None,
+) -> Iterator[Path]:
     """Write a run in the format called `name`; yields every file once it is complete.
 
-    out   a folder, or a .txt file for poses; beside the run if not given
-    data  where the run's data set is now, if not where it was
+    out    a folder, or a .txt file for poses; beside the run if not given
+    data   where the run's data set is now, if not where it was
+    masks  for MASKED_FORMATS, the archive that says which sweeps and points to write
 
     Files of the same name are replaced, other files in `out` stay. Raises DataError for an unknown format, a
     run that is not finished and data that are not at hand; InstallError where a format's package is missing.
     """
     write = find(name)
+    if masks is not None:
+        if name not in MASKED_FORMATS:
+            raise DataError(f"--masks {masks}: {name} takes none, it has every point; only "
+                            f"{', '.join(MASKED_FORMATS)} does")
+        write = functools.partial(write, masks=Path(masks))
     run_dir = Path(run_dir)
     out = default_out(run_dir, name) if out is None else Path(out)
     if name in POSE_FORMATS:
@@ -46,7 +57,7 @@ def export(run_dir: Path, name: str, out: Path | None = None, data: Path | None 
     yield from write(FinishedRun.read(run_dir, data), out)
 
 
-def find(name: str) -> Callable[[FinishedRun, Path], Iterator[Path]]:
+def find(name: str) -> Callable[..., Iterator[Path]]:
     """The format called `name`; DataError, which names the nearest, where there is none."""
     if name not in FORMATS:
         close = difflib.get_close_matches(name, FORMATS, n=1, cutoff=0.4)

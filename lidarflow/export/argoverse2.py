@@ -5,6 +5,7 @@ v2 (2024)  is_valid, and the flow that points do by themselves: ego-motion remov
 v3         that flow alone
 
 Flow is float16, in the axes of the target's frame. What is not known of a NaN point is NaN, and not valid.
+v1 wants the sweeps and points of the official masks alone; the others want every point.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,16 +13,21 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow.errors import InstallError
+from lidarflow.errors import DataError, InstallError
+from lidarflow.export.argoverse2_masks import Masks
 from lidarflow.export.finished_run import FinishedRun, scene_name
 from lidarflow.io import FlowFile, written_aside
 
 COLUMNS = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
-def write_v1(run: FinishedRun, out: Path) -> Iterator[Path]:
-    """Total flow, and which points move over ground."""
-    return _write(run, out, lambda found: {**_flow_columns(found.flow), "is_dynamic": found.is_dynamic})
+def write_v1(run: FinishedRun, out: Path, masks: Path | None = None) -> Iterator[Path]:
+    """Total flow, and which points move over ground: of all points, or those in an archive of `masks`.
+
+    With masks, files are those of a submission. DataError where the run lacks a sweep that they count.
+    """
+    return _write(run, out, lambda found: {
+        **_flow_columns(found.flow), "is_dynamic": found.is_dynamic}, masks)
 
 
 def write_v2(run: FinishedRun, out: Path) -> Iterator[Path]:
@@ -36,19 +42,37 @@ def write_v3(run: FinishedRun, out: Path) -> Iterator[Path]:
 
 
 def _write(
-    run: FinishedRun, out: Path, columns_of: Callable[[FlowFile], dict[str, np.ndarray]]
+    run: FinishedRun, out: Path, columns_of: Callable[[FlowFile], dict[str, np.ndarray]],
+    masks: Path | None = None,
 ) -> Iterator[Path]:
     try:
         import pyarrow
         from pyarrow import feather
     except ImportError:
         raise InstallError(f"{out}: .feather needs the package pyarrow; pip install pyarrow") from None
-    log = out / scene_name(run.dataset())
+    log = scene_name(run.dataset())
+    counted = None if masks is None else _counted(run, Masks.find(masks, log))
     for number, _, found in run.pairs():
-        file = log / f"{run.times_ns[number]}.feather"
+        time_ns = int(run.times_ns[number])
+        columns = columns_of(found)
+        if counted is not None:
+            if time_ns not in counted.times_ns:
+                continue
+            mask = counted.of(time_ns, len(found.points))
+            columns = {name: values[mask] for name, values in columns.items()}
+        file = out / log / f"{time_ns}.feather"
         with written_aside(file) as aside:
-            feather.write_feather(pyarrow.table(columns_of(found)), str(aside))
+            feather.write_feather(pyarrow.table(columns), str(aside))
         yield file
+
+
+def _counted(run: FinishedRun, masks: Masks) -> Masks:
+    """`masks`; DataError where they count a sweep that the run has no flow of."""
+    lacking = sorted(masks.times_ns - set(run.times_ns[:-1].tolist()))
+    if lacking:
+        raise DataError(f"{run.folder}: no flow of {len(lacking)} of the {len(masks.times_ns)} sweeps that "
+                        f"{masks.archive} counts, {lacking[0]} is the first; run over the whole log")
+    return masks
 
 
 def _flow_columns(flow: np.ndarray) -> dict[str, np.ndarray]:

@@ -28,11 +28,21 @@ def estimate_flow(
 class RgbdEstimator:
     """Scene flow along a sequence: pyramids and the segmentation are carried from pair to pair."""
 
+    tracks: None = None     # no object has a number
+
     def __init__(self, camera: Camera, config: RgbdConfig | None = None):
         self.camera = camera
         self.config = config or RgbdConfig()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew with the next frame."""
         self._levels: tuple[pyramid.Level, ...] | None = None
         self._previous: RgbdResult | None = None
+
+    def follow(self, frame: RgbdFrame, known: RgbdResult, tracks: None = None) -> None:
+        """As `step` where its answer is known: the next step is the same."""
+        self._levels, self._previous = pyramid.build(frame, self.camera, self.config.images), known
 
     def step(self, frame: RgbdFrame) -> RgbdResult | None:
         """Result of the pair of the last frame and this one; None for the first. Raises as estimate_flow."""

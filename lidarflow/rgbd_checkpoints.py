@@ -1,0 +1,43 @@
+"""What a run keeps of every finished RGB-D pair until it is complete; as checkpoints.py for LiDAR pairs."""
+
+import json
+from io import BytesIO
+
+import numpy as np
+
+from lidarflow.checkpoints import CheckpointFiles, digest_of, naming_damage, read_bound
+from lidarflow.rgbd_types import Camera, RgbdPair, RgbdResult
+
+_PLAIN = ("flow", "points", "valid", "label", "b", "cluster_motions", "odometry", "is_dynamic", "centres")
+_NAMES = ("digest", *_PLAIN, "camera", "notes")
+
+
+class RgbdCheckpoints(CheckpointFiles):
+    """The checkpoints of an RGB-D run: what goes from pair to pair is the last pair's answer and frame."""
+
+    def save(self, index: int, pair: RgbdPair, result: RgbdResult, tracks: None = None) -> None:
+        """Keep the answer of the pair at `index`."""
+        camera = result.camera
+        arrays = {name: getattr(result, name) for name in _PLAIN} | {
+            "digest": np.array(_digest(pair)), "notes": np.array(json.dumps({"seconds": result.seconds})),
+            "camera": np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy])}
+        content = BytesIO()
+        np.savez_compressed(content, **arrays)
+        self.put(index, content.getvalue())
+
+    def load(self, index: int, pair: RgbdPair) -> tuple[RgbdResult, None]:
+        """The answer of the pair at `index`; DataError where it is damaged, or was made of other images."""
+        file = self.file(index)
+        arrays = read_bound(file, _NAMES, _digest(pair), (pair.source.name, pair.target.name))
+        with naming_damage(file):
+            width, height, *intrinsics = arrays["camera"].tolist()
+            return RgbdResult(
+                camera=Camera(int(width), int(height), *intrinsics),
+                seconds=json.loads(str(arrays["notes"]))["seconds"],
+                **{name: arrays[name] for name in _PLAIN}), None
+
+
+def _digest(pair: RgbdPair) -> str:
+    return digest_of(
+        (f"{frame.name} {frame.time_ns} {frame.shape} ", image)
+        for frame in (pair.source, pair.target) for image in (frame.intensity, frame.depth, frame.color))
