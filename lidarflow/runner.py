@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarflow import io, methods, metrics, pose, preview, provenance, resuming
+from lidarflow.aside import ahead
 from lidarflow.checkpoints import Checkpoints
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
@@ -138,7 +139,8 @@ def begun_steps(walk: Walk, plan: Plan, kept: Kept, out: Path, going: Going
                 ) -> tuple[Iterator[Step], list[Skipped]]:
     """The pairs of a run, whose folder `out` is ready for results, and the scans that are left out.
 
-    Those come to the list as the pairs are gone through. The first pair is done before the folder is touched:
+    Those come to the list as the pairs are gone through. The next pair is read and computed while one is
+    written. The first pair is done before the folder is touched:
     bad data leave no empty run behind. Raises LidarflowError where nothing can be used or `out` holds
     another run.
     """
@@ -160,7 +162,7 @@ def begun_steps(walk: Walk, plan: Plan, kept: Kept, out: Path, going: Going
         io.remove_left_overs(out)
     else:
         resuming.begin(out, plan)
-    return itertools.chain([first], done), skipped
+    return ahead(itertools.chain([first], done)), skipped
 
 
 def begin(dataset: Dataset, frames: list[int], config: Config, out: Path, method: str, going: Going
