@@ -262,7 +262,8 @@ def _refined(
     motions = dense[part.rows]
     if len(motions) and prepared.target_mesh is not None:
         surface = refinement.Surface.around(
-            part.problem.points, pair.target.points, target.cloud.upright.tree, prepared.target_mesh)
+            pose.apply(motions, part.problem.points), pair.target.points,
+            np.flatnonzero(target.usable & ~target.ground), target.cloud.upright.tree, prepared.target_mesh)
         motions = refinement.refined(
             part.problem, motions, surface,
             lambda problem, settings: solve(problem, settings, config.graph.min_matches),

@@ -28,14 +28,6 @@ def query(tree: Tree, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, n
     return distance_m, row
 
 
-def nearest_points(tree: Tree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The tree's nearest point (N, 3) to each point (N, 3), and its distance (N,); NaN, inf without any."""
-    distance_m, row = query(tree, points, np.inf)
-    ordered = np.full((len(tree.rows) + 1, 3), np.nan)   # by row; what has none gets the last
-    ordered[tree.rows] = tree.points
-    return ordered[row], distance_m
-
-
 def near_rows(tree: Tree, body: Tree, radius_m: float) -> np.ndarray:
     """Ascending rows of the tree's points that are nearer than `radius_m` to any point of a body."""
     return np.sort(_near_rows(tree, body, float(radius_m)))
