@@ -202,7 +202,7 @@ def scene(car_shift: np.ndarray, seed: int, wall_shift: np.ndarray = (0.0, 0.0, 
 @pytest.mark.parametrize("shift_m", [0.08, 0.15, 0.6, 1.4])
 def test_slow_and_fast_bodies_are_found(shift_m):
     view = scene(np.array([shift_m, 0.0, 0.0]), 11)
-    body, = objects.find(view, seeds.find(view, [], CONFIG), 0.1, CONFIG)
+    body, = objects.find(view, seeds.find(view, tree.NOTHING, CONFIG), 0.1, CONFIG)
     on_box = view.points[:, 0] < 12.0
     assert on_box[body.rows].all() and len(body.rows) > 0.9 * on_box.sum()
     off_m = pose.apply(body.over_ground, view.points[body.rows]) - view.points[body.rows] - [shift_m, 0, 0]
@@ -211,7 +211,7 @@ def test_slow_and_fast_bodies_are_found(shift_m):
 
 def test_a_still_scene_has_no_body():
     view = scene(np.zeros(3), 12)
-    assert objects.find(view, seeds.find(view, [], CONFIG), 0.1, CONFIG) == []
+    assert objects.find(view, seeds.find(view, tree.NOTHING, CONFIG), 0.1, CONFIG) == []
 
 
 def test_a_wall_is_not_believed_to_slide_along_itself():

@@ -28,6 +28,14 @@ def query(tree: Tree, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, n
     return distance_m, row
 
 
+def nearest_m(tree: Tree, points: np.ndarray, known_m: np.ndarray, reach_m: float) -> np.ndarray:
+    """Distance (N,) from each of points (N, 3) to the nearest of the tree, or `known_m` (N,) if that is less.
+
+    What is not nearer than `reach_m` is as far as known.
+    """
+    return _nearest_m(tree, np.ascontiguousarray(points), known_m, float(reach_m))
+
+
 def near_rows(tree: Tree, body: Tree, radius_m: float) -> np.ndarray:
     """Ascending rows of the tree's points that are nearer than `radius_m` to any point of a body."""
     return np.sort(rows_near(tree, body, float(radius_m)))
@@ -70,6 +78,17 @@ def _query(tree, points, reach_m, distance_m, row):
         place, apart_sq = nearest(tree, points[i, 0], points[i, 1], points[i, 2], reach_m * reach_m, -1)
         if place >= 0:
             distance_m[i], row[i] = math.sqrt(apart_sq), tree.rows[place]
+
+
+@njit(parallel=True)
+def _nearest_m(tree, points, known_m, reach_m):
+    distance_m = known_m.copy()
+    for i in numba.prange(len(points)):
+        bound_m = min(known_m[i], reach_m)
+        place, apart_sq = nearest(tree, points[i, 0], points[i, 1], points[i, 2], bound_m * bound_m, -1)
+        if place >= 0:
+            distance_m[i] = math.sqrt(apart_sq)
+    return distance_m
 
 
 @njit(parallel=True)

@@ -20,7 +20,7 @@ _MAX_START_POINTS = 300  # as many choose the start; the fit that follows uses a
 
 def find(
     view: View, found: seeds.Seeds, dt_s: float, config: ObjectsConfig,
-    expected: tuple[hypotheses.Expected, ...] = (),
+    expected: hypotheses.Expected = hypotheses.NONE,
 ) -> list[Body]:
     """The moving objects of a view, sought at seeds; no point belongs to two, the best supported come first.
 
@@ -70,7 +70,7 @@ def describe(
 
 def _best_starts(
     view: View, found: seeds.Seeds, clusters: tuple[np.ndarray, ...],
-    expected: tuple[hypotheses.Expected, ...],
+    expected: hypotheses.Expected,
 ) -> list[np.ndarray | None]:
     """For each cluster of seeds, the motion (4, 4) that explains it best, from what is proposed for it.
 
