@@ -51,7 +51,7 @@ def _some_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m, m
     starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
     last, run_count = (0, 0, 0), 0
     factor, t = np.empty((3, 3)), np.empty(3)
-    near = np.empty(len(at), np.int64)
+    near = np.empty(len(at) + 1, np.int64)
     for i in range(len(points)):
         # Points that follow one another are often in one cell.
         cell = grid.cell_of(points[i], lower, radius_m)
@@ -61,10 +61,11 @@ def _some_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m, m
         count, total_sq = 0, 0.0
         for run in range(run_count):
             for j in range(starts[run], ends[run]):
-                if _distance_sq(points, i, at, j) <= radius_m * radius_m:
-                    near[count] = j
-                    count += 1
-                    total_sq += offsets_m[j] * offsets_m[j]
+                # Without a branch, which would be guessed wrong for every third.
+                near[count] = j
+                count += _distance_sq(points, i, at, j) <= radius_m * radius_m
+        for j in near[:count]:
+            total_sq += offsets_m[j] * offsets_m[j]
         counts[i] = count
         if count == 0:
             continue
