@@ -244,7 +244,7 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
                 pair.target.points[prepared.target.usable], pair.dt_s, config.dynamic)
         valid = source.ground | found.explained | is_solved
         object_id = np.append(found.ids, np.int32(-1))[found.owner]
-        std_m = _std(points, found, graph, motions, solved, flow, by_group, config)
+        std_m = _std(points, found, graph, motions, solved, in_graph, flow, by_group, config)
         std_m[~valid] = np.nan
     result = FlowResult(
         flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,
@@ -272,7 +272,8 @@ def _refined(
     motions = dense[part.rows]
     if len(motions) and prepared.target_mesh is not None:
         surface = refinement.Surface.around(
-            part.problem.points, pair.target.points, target.cloud.upright.tree, prepared.target_mesh)
+            pose.apply(motions, part.problem.points), pair.target.points,
+            np.flatnonzero(target.usable & ~target.ground), target.cloud.upright.tree, prepared.target_mesh)
         motions = refinement.refined(
             part.problem, motions, surface,
             lambda problem, settings: solve(problem, settings, config.graph.min_matches),
@@ -282,17 +283,19 @@ def _refined(
 
 def _std(
     points: np.ndarray, found: Attribution, graph: frontend.Graph, motions: np.ndarray, solved: np.ndarray,
-    flow: np.ndarray, by_group: np.ndarray, config: Config,
+    in_graph: np.ndarray, flow: np.ndarray, by_group: np.ndarray, config: Config,
 ) -> np.ndarray:
     """Standard deviation (N,) of the flow in metres.
 
-    A point of a group errs with the group's motion, and where it has been moved away from the group, by that
-    much more. Without groups, the matches around it tell.
+    A point of a group errs with the group's motion, and where it has been moved away from the group, as only
+    points of a graph are, by that much more. Without groups, the matches around it tell.
     """
-    if config.objects.enabled:
-        apart_m = np.linalg.norm(pose.apply(by_group, points) - points - flow, axis=1)
-        return np.hypot(found.std_m, apart_m)
     std_m = found.std_m.copy()
+    if config.objects.enabled:
+        own = points[in_graph]
+        apart_m = np.linalg.norm(pose.apply(by_group[in_graph], own) - own - flow[in_graph], axis=1)
+        std_m[in_graph] = np.hypot(std_m[in_graph], apart_m)
+        return std_m
     rows = graph.rows[solved]
     if len(rows):
         std_m[rows] = uncertainties.of_matches(graph.problem, motions, config.solver.truncation_m)[solved]

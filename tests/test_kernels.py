@@ -165,6 +165,13 @@ def check_local_shifts(count: int) -> None:
     given = points, planes, offsets_m, 0.5
     for found, expected in zip(coherence.local_shifts(*given), local_shifts_twin(*given), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-9)
+    shift, planes_around, before_m, after_m = coherence.local_shifts(*given)
+    least, least_m = int(np.median(planes_around)), float(np.median(before_m))
+    told = (planes_around >= least) & (before_m >= least_m)
+    assert 0 < told.sum() < count
+    limited = coherence.local_shifts(*given, least, least_m)
+    np.testing.assert_array_equal(limited[0], np.where(told[:, None], shift, 0.0))
+    np.testing.assert_array_equal(limited[3], np.where(told, after_m, before_m))
 
 
 # ---- SHOT -----------------------------------------------------------------------------------------------

@@ -73,6 +73,11 @@ def check_tree(count: int) -> None:
     reach_m = rng(3).uniform(0.01, 1.0, len(queries))
     np.testing.assert_array_equal(
         neighbours.any_within(built, queries, reach_m), apart_m.min(axis=1) <= reach_m)
+    np.testing.assert_allclose(
+        neighbours.nearest_m(built, queries, reach_m, 0.7),
+        np.where(near, np.minimum(apart_m.min(axis=1), reach_m), reach_m), atol=1e-12)
+    np.testing.assert_array_equal(
+        neighbours.number_around(built, queries, 0.5), (apart_m <= 0.5).sum(axis=1))
     marks = rng(4).random((count, 2)) < 0.4
     expected = [[(inside & mark).sum() for mark in marks.T] for inside in apart_m <= 0.5]
     np.testing.assert_array_equal(neighbours.counts_around(built, marks, queries, 0.5), expected)
@@ -138,6 +143,8 @@ def check_votes(count: int) -> None:
     near = cdist(shifts, shifts) <= 0.15
     expected = shifts[near[near.sum(axis=1).argmax()]].mean(axis=0)
     np.testing.assert_allclose(votes.mode(shifts, 0.15), expected, atol=1e-12)
+    for some in (shifts[:1], shifts[:6], shifts[:7]):
+        np.testing.assert_array_equal(votes.median(some), np.median(some, axis=0))
 
     source, target = random.uniform(-2, 2, (count, 3)), random.uniform(-2, 2, (count + 5, 3))
     every = (target[None] - source[:, None]).reshape(-1, 3)

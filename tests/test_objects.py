@@ -10,12 +10,12 @@ from shared_data import SHARED, needs_shared
 from lidarflow import pose, synthetic
 from lidarflow.config import ObjectsConfig
 from lidarflow.datasets import open_dataset
-from lidarflow.kernels import links, tree
+from lidarflow.kernels import grid, ground_plane, icp, links, tree
 from lidarflow.lidar import acceptance, evidence, frontend, objects, rigid_fit, seeds
 from lidarflow.lidar import body as body_of
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
-from lidarflow.lidar.surface import Cloud, Surface
+from lidarflow.lidar.surface import MIN_AGREEMENT, Cloud, Surface
 from lidarflow.pipeline import FlowEstimator, estimate_flow, run
 from lidarflow.types import FlowProblem, ScanPair
 
@@ -142,6 +142,14 @@ def test_nothing_moves_in_a_static_yard():
     assert np.linalg.norm(result.flow - scans[0][1].flow, axis=1).mean() < 0.01
 
 
+def onto_planes(source: Surface, target: Surface, turn: float, shift: list[float]) -> np.ndarray:
+    """The motion (4, 4) that growth fits to a whole surface on level ground."""
+    return icp.onto_planes(
+        source.points, source.normals, target.tree, target.normals, turn, np.array(shift),
+        rigid_fit.PLANE_GATES_M, np.array([0.0, 0.0, 1.0]), 1.0, rigid_fit.PLANE_SCALE_M,
+        rigid_fit.POINT_SCALE_M, rigid_fit.POINT_WEIGHT, MIN_AGREEMENT)
+
+
 def test_the_ground_tells_which_way_a_fit_may_go():
     hood = np.stack(np.meshgrid(np.linspace(0, 1.5, 40), np.linspace(-0.8, 0.8, 30)), axis=-1).reshape(-1, 2)
     hood = np.column_stack([hood + [8.0, 0.0], 0.15 * hood[:, 0]])   # 15 % slope, so that x and z trade
@@ -150,9 +158,7 @@ def test_the_ground_tells_which_way_a_fit_may_go():
     truth = pose.from_translation([0.5, 0.0, 0.0])
     target = Surface.of(pose.apply(truth, body) + rng(8).normal(0, 0.004, body.shape), 0.12, 0.5)
     source = Surface.of(body, 0.12, 0.5)
-    found = rigid_fit.onto_planes(
-        source.points, source.normals, target, pose.from_translation([0.35, 0, 0.05]),
-        np.array([0.0, 0.0, 1.0]), 1.0)
+    found = onto_planes(source, target, 0.0, [0.35, 0.0, 0.05])
     np.testing.assert_allclose(found[:3, 3], [0.5, 0.0, 0.0], atol=0.02)
 
 
@@ -166,9 +172,7 @@ def rings_on_hood(shift_m: float) -> np.ndarray:
 def test_planes_are_not_carried_along_by_rings():
     source, target = Surface.of(rings_on_hood(0.0), 0.12, 0.6), Surface.of(rings_on_hood(0.2), 0.12, 0.6)
     by_points, = rigid_fit.onto([source.points], [(0, np.array([0.1, 0.0, 0.0]))], target.tree)
-    by_planes = rigid_fit.onto_planes(
-        source.points, source.normals, target, pose.from_translation([0.1, 0.0, 0.0]),
-        np.array([0.0, 0.0, 1.0]), 1.0)
+    by_planes = onto_planes(source, target, 0.0, [0.1, 0.0, 0.0])
     moved = pose.apply(by_planes, source.points) - source.points
     np.testing.assert_allclose(moved.mean(axis=0), [0.2, 0.0, 0.0], atol=0.03)
     assert abs(by_points[0, 3] - 0.2) > 0.1, "nearest points follow the rings"
@@ -198,7 +202,7 @@ def scene(car_shift: np.ndarray, seed: int, wall_shift: np.ndarray = (0.0, 0.0, 
 @pytest.mark.parametrize("shift_m", [0.08, 0.15, 0.6, 1.4])
 def test_slow_and_fast_bodies_are_found(shift_m):
     view = scene(np.array([shift_m, 0.0, 0.0]), 11)
-    body, = objects.find(view, seeds.find(view, [], CONFIG), 0.1, CONFIG)
+    body, = objects.find(view, seeds.find(view, tree.NOTHING, CONFIG), 0.1, CONFIG)
     on_box = view.points[:, 0] < 12.0
     assert on_box[body.rows].all() and len(body.rows) > 0.9 * on_box.sum()
     off_m = pose.apply(body.over_ground, view.points[body.rows]) - view.points[body.rows] - [shift_m, 0, 0]
@@ -207,7 +211,7 @@ def test_slow_and_fast_bodies_are_found(shift_m):
 
 def test_a_still_scene_has_no_body():
     view = scene(np.zeros(3), 12)
-    assert objects.find(view, seeds.find(view, [], CONFIG), 0.1, CONFIG) == []
+    assert objects.find(view, seeds.find(view, tree.NOTHING, CONFIG), 0.1, CONFIG) == []
 
 
 def test_a_wall_is_not_believed_to_slide_along_itself():
@@ -238,6 +242,63 @@ def test_what_the_surroundings_do_too_is_not_a_body():
     body = Body(part, pose.from_translation(shift))
     assert acceptance._surroundings_gain(view, body, shift)
     assert not acceptance.moves(view, body, 0.1, CONFIG)
+
+
+def grown_twin(view: view_of_pair.View, seed: np.ndarray, start: np.ndarray, free: np.ndarray) -> Body | None:
+    """Growth step by step."""
+    near, motion, body = seed, start, seed
+    looked = np.zeros(len(view.points), bool)
+    for step in range(5):
+        reach_m = 1.0 if step == 0 else 0.7
+        apart_m, _ = cKDTree(view.points[body]).query(view.points)
+        if not (looked | (apart_m < reach_m)).sum() > looked.sum():
+            break
+        looked |= apart_m < reach_m
+        near = np.flatnonzero(looked & free)
+        after, ego = view.after(near, motion), view.by_ego[near]
+        fits = after.distance_m <= view.tolerance_m[near]
+        better = after.distance_m < ego.distance_m - 0.02
+        plane_better = fits & (after.plane_m < ego.plane_m - 0.03)
+        as_good = (fits & (after.distance_m < ego.distance_m + 0.03)
+                   & (after.plane_m < ego.plane_m + 0.02))
+        plane_worse = (after.plane_m > ego.plane_m + 0.03) & ~better
+        body = near[(better | plane_better | as_good) & ~plane_worse]
+        label = links.components(view.points[body], 0.5)
+        body = body[np.isin(label, label[np.isin(body, seed)])]
+        if len(body) < CONFIG.min_points:
+            return None
+        thinned = body[grid.first_per_voxel(view.points[body], 0.12)] if len(body) > 40 else body
+        points = view.points[thinned]
+        centre, turn = points.mean(axis=0), np.arctan2(motion[1, 0], motion[0, 0])
+        rise_x, rise_y, count = ground_plane.slope(view.ground, centre, 5.0)
+        up = np.array([-rise_x, -rise_y, 1.0])
+        if count < 20 or np.hypot(rise_x, rise_y) > 0.2:
+            up = np.array([0.0, 0.0, 1.0])
+        motion = icp.onto_planes(
+            points, view.source.normals[thinned], view.upright.tree, view.upright.normals, turn,
+            pose.apply(motion, centre) - centre, rigid_fit.PLANE_GATES_M, up / np.linalg.norm(up),
+            CONFIG.along_ground, 0.05, 0.15, 0.05, MIN_AGREEMENT)
+    return Body(body, motion)
+
+
+def test_bodies_grow_step_by_step_and_each_as_if_alone():
+    view = scene(np.array([0.6, 0.0, 0.0]), 14)
+    on_box = np.flatnonzero(view.points[:, 0] < 12.0)
+    seeds = [on_box[::9], on_box[5:6], np.flatnonzero(view.points[:, 0] > 13.0)[:40]]
+    starts = [pose.from_translation(shift) for shift in ([0.55, 0.03, 0.0], [0.6, 0.0, 0.0], [0.6, 0.0, 0.0])]
+    free = np.ones(len(view.points), bool)
+    free[on_box[:100]] = False
+    found = body_of.grown(view, seeds, starts, free, CONFIG)
+    for seed, start, growth in zip(seeds, starts, found, strict=True):
+        alone, = body_of.grown(view, [seed], [start], free, CONFIG)
+        expected = grown_twin(view, seed, start, free)
+        np.testing.assert_array_equal(growth.asked, alone.asked)
+        assert (growth.body is None) == (expected is None) == (alone.body is None)
+        if expected is not None:
+            np.testing.assert_array_equal(growth.body.rows, expected.rows)
+            np.testing.assert_allclose(growth.body.over_ground, expected.over_ground, atol=1e-9)
+            assert growth.asked[growth.body.rows].all() and free[growth.body.rows].all()
+    assert found[0].body is not None and len(found[0].body.rows) > 0.8 * (len(on_box) - 100)
 
 
 def test_a_body_is_completed_by_what_it_surrounds_and_what_follows_it():

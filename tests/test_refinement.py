@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from worlds import grid_edges
 
 from lidarflow import open3d_import, pose, synthetic
 from lidarflow.config import Config, RefineConfig, load
-from lidarflow.kernels import tree
+from lidarflow.kernels import tree, triangles
 from lidarflow.lidar import mesh, refinement
 from lidarflow.pipeline import estimate_flow
 from lidarflow.synthetic.human_motion import LIMBS
@@ -62,14 +63,15 @@ def test_the_nearest_place_lies_within_a_triangle_and_else_on_a_point():
     points = np.array([[5.0, 0.0, 0.0], [5.0, 1.0, 0.0], [5.0, 0.0, 1.0], [5.0, 3.0, 0.0], [5.0, 0.0, 9.0]])
     one_triangle = mesh.Mesh(np.array([[0, 1, 2]], np.int32), np.array([[0, 1], [0, 2], [1, 2]], np.int32),
                              np.array([0, 0, 0, 1, 2], np.int32), "grid")
-    surface = refinement.Surface.around(points[:4], points, tree.build(points), one_triangle)
+    surface = refinement.Surface.around(points[:4], points, np.arange(5), tree.build(points), one_triangle)
     asked = np.array([[5.2, 0.25, 0.25], [4.9, 2.9, 0.1], [5.1, -0.3, 0.5]])
     np.testing.assert_allclose(
-        surface.nearest(asked), [[5.0, 0.25, 0.25], [5.0, 3.0, 0.0], [5.0, 0.0, 0.5]], atol=1e-6)
+        surface.nearest(asked, 0.5), [[5.0, 0.25, 0.25], [5.0, 3.0, 0.0], [5.0, 0.0, 0.5]], atol=1e-12)
+    assert np.isnan(surface.nearest(asked, 0.1)).all()
     no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(5), "grid")
-    without_corner = tree.build(np.delete(points, 1, axis=0))
-    bare = refinement.Surface.around(points[:4], points, without_corner, no_triangles)
-    np.testing.assert_allclose(bare.nearest(asked[:1]), [[5.0, 0.0, 0.0]], atol=1e-6)
+    others = np.array([0, 2, 3, 4])
+    bare = refinement.Surface.around(points[:4], points, others, tree.build(points[others]), no_triangles)
+    np.testing.assert_allclose(bare.nearest(asked[:1], 0.5), [[5.0, 0.0, 0.0]])
 
 
 def test_places_out_of_reach_say_nothing():
@@ -77,7 +79,8 @@ def test_places_out_of_reach_say_nothing():
     points = problem.points + [0.1, 0.0, 0.0]
     points[problem.points[:, 2] > 0.9, 0] += 1.0
     no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(16), "grid")
-    surface = refinement.Surface.around(problem.points, points, tree.build(points), no_triangles)
+    surface = refinement.Surface.around(
+        problem.points, points, np.arange(16), tree.build(points), no_triangles)
     matched = refinement.rematched(problem, problem.initial, surface, 0.3)
     np.testing.assert_array_equal(matched.match_index, np.flatnonzero(problem.points[:, 2] < 0.9))
     np.testing.assert_allclose(matched.match_target, points[matched.match_index])
@@ -87,8 +90,37 @@ def test_a_scan_without_a_point_upright_says_nothing():
     problem = patches((8.0, 1.0))
     no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(4), "grid")
     ground = np.array([[8.0, y, -1.7] for y in range(4)])
-    surface = refinement.Surface.around(problem.points, ground, tree.build(np.empty((0, 3))), no_triangles)
+    surface = refinement.Surface.around(
+        problem.points, ground, np.empty(0, np.int64), tree.build(np.empty((0, 3))), no_triangles)
     assert len(refinement.rematched(problem, problem.initial, surface, 0.3).match_index) == 0
+
+
+def test_the_nearest_place_on_triangles_is_the_nearest_of_a_fine_sampling_and_what_is_lone_counts_too():
+    generator = rng(5)
+    corners = generator.uniform(-1.0, 1.0, (40, 1, 3)) + generator.normal(0.0, 0.2, (40, 3, 3))
+    corners[0, 2] = corners[0, 1]                   # a triangle without an area
+    lone = generator.uniform(-1.5, 1.5, (30, 3))
+    asked = generator.uniform(-1.5, 1.5, (700, 3))   # more than one thread's share
+    shares = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60.0
+    sampled = np.concatenate([np.einsum("sk,tkd->tsd", shares, corners).reshape(-1, 3), lone])
+    sampled_m, _ = KDTree(sampled).query(asked)
+
+    places = triangles.nearest(triangles.build(corners), tree.build(lone), asked, 0.6)
+    apart_m = np.linalg.norm(places - asked, axis=1)
+    found = np.isfinite(apart_m)
+    assert 300 < found.sum() < 700
+    np.testing.assert_array_equal(found, np.where(np.abs(sampled_m - 0.6) < 0.01, found, sampled_m < 0.6))
+    assert (apart_m[found] <= sampled_m[found] + 1e-9).all()
+    assert (apart_m[found] > sampled_m[found] - 0.015).all()
+    on_surface_m, _ = KDTree(sampled).query(places[found])
+    assert on_surface_m.max() < 0.015
+
+    flat = np.cross(corners[1, 1] - corners[1, 0], corners[1, 2] - corners[1, 0])
+    within = corners[1].mean(axis=0)
+    above = within + 0.1 * flat / np.linalg.norm(flat)
+    alone = triangles.nearest(triangles.build(corners[1:2]), tree.NOTHING, above[None], 0.6)
+    np.testing.assert_allclose(alone, within[None], atol=1e-12)
+    assert np.isnan(triangles.nearest(triangles.build(corners[:0]), tree.NOTHING, above[None], 0.6)).all()
 
 
 # ---- people -----------------------------------------------------------------------------------------------

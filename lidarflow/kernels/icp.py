@@ -36,7 +36,7 @@ def onto_points(points, bounds, group, translations, target, gates_m, rounds_per
 
 @njit()
 def _onto_points(points, target, translation, gates_m, rounds_per_gate, motion):
-    centre = _mean(points)
+    centre = mean(points)
     count = len(points)
     turn, shift = 0.0, translation.copy()
     place, asked, clear_m = np.full(count, -1), np.zeros((count, 3)), np.full(count, -np.inf)
@@ -90,7 +90,7 @@ def onto_planes(
     Each round is one Gauss-Newton step of Σ ρ(n · off) + w Σ ρ(off) over pairs no farther apart than the
     round's gate; n is the plane where normals agree, ρ of Geman and McClure.
     """
-    centre = _mean(points)
+    centre = mean(points)
     shift = shift.copy()
     place, asked = np.full(len(points), -1), np.zeros((len(points), 3))
     clear_m = np.full(len(points), -np.inf)
@@ -195,7 +195,7 @@ def follow(target, x, y, z, gate_m, i, place, asked, clear_m):
 
 
 @njit()
-def _mean(points):
+def mean(points):
     mean = np.zeros(3)
     for i in range(len(points)):
         for k in range(3):

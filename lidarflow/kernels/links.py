@@ -18,11 +18,12 @@ def components(points: np.ndarray, link_m: float) -> np.ndarray:
     Points are first gathered in cells of a third of that distance, whose means are then linked. Labels count
     from 0 in the order of the components' lowest cells.
     """
-    return _components(np.ascontiguousarray(points), float(link_m))
+    return joined(np.ascontiguousarray(points), float(link_m))
 
 
 @njit()
-def _components(points, link_m):
+def joined(points, link_m):
+    """As `components`, for other kernels."""
     member, means, place = _cells(points, link_m / _CELLS_PER_LINK)
     label = _linked(means, trees.grown(means), link_m)
     of_point = np.empty(len(points), np.int64)

@@ -70,20 +70,26 @@ def after(points, normals, rows, motion, target, target_normals, beside, cap_m, 
     Both are at most `cap_m`. Distances are to the nearest of `target` and `beside`; plane distances are to
     the plane of the nearest of `target` within twice the cap where normals agree, and never more.
     """
-    reach_sq, cap_sq = 4.0 * cap_m * cap_m, cap_m * cap_m
     for k in range(len(rows)):
-        x, y, z = moved(points[rows[k]], motion)
-        place, apart_sq = trees.nearest(target, x, y, z, reach_sq, -1)
-        _, nearest_sq = trees.nearest(beside, x, y, z, min(apart_sq, cap_sq), -1)
-        distance_m[k] = plane_m[k] = math.sqrt(nearest_sq)
-        if place >= 0:
-            plane = target_normals[target.rows[place]]
-            nx, ny, nz = turned(normals[rows[k]], motion)
-            if agree(plane, nx, ny, nz, min_agreement):
-                at = target.points[place]
-                offset_m = abs(plane[0] * (at[0] - x) + plane[1] * (at[1] - y) + plane[2] * (at[2] - z))
-                plane_m[k] = min(offset_m, distance_m[k])
+        distance_m[k], plane_m[k] = after_one(
+            points[rows[k]], normals[rows[k]], motion, target, target_normals, beside, cap_m, min_agreement)
 
+
+@njit()
+def after_one(point, normal, motion, target, target_normals, beside, cap_m, min_agreement):
+    """As `after`, of one point (3,) with a normal (3,): its distance and its plane distance."""
+    x, y, z = moved(point, motion)
+    place, apart_sq = trees.nearest(target, x, y, z, 4.0 * cap_m * cap_m, -1)
+    _, nearest_sq = trees.nearest(beside, x, y, z, min(apart_sq, cap_m * cap_m), -1)
+    distance_m = math.sqrt(nearest_sq)
+    if place >= 0:
+        plane = target_normals[target.rows[place]]
+        nx, ny, nz = turned(normal, motion)
+        if agree(plane, nx, ny, nz, min_agreement):
+            at = target.points[place]
+            offset_m = abs(plane[0] * (at[0] - x) + plane[1] * (at[1] - y) + plane[2] * (at[2] - z))
+            return distance_m, min(offset_m, distance_m)
+    return distance_m, distance_m
 
 
 @njit(parallel=True)

@@ -28,17 +28,17 @@ def query(tree: Tree, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, n
     return distance_m, row
 
 
-def nearest_points(tree: Tree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The tree's nearest point (N, 3) to each point (N, 3), and its distance (N,); NaN, inf without any."""
-    distance_m, row = query(tree, points, np.inf)
-    ordered = np.full((len(tree.rows) + 1, 3), np.nan)   # by row; what has none gets the last
-    ordered[tree.rows] = tree.points
-    return ordered[row], distance_m
+def nearest_m(tree: Tree, points: np.ndarray, known_m: np.ndarray, reach_m: float) -> np.ndarray:
+    """Distance (N,) from each of points (N, 3) to the nearest of the tree, or `known_m` (N,) if that is less.
+
+    What is not nearer than `reach_m` is as far as known.
+    """
+    return _nearest_m(tree, np.ascontiguousarray(points), known_m, float(reach_m))
 
 
 def near_rows(tree: Tree, body: Tree, radius_m: float) -> np.ndarray:
     """Ascending rows of the tree's points that are nearer than `radius_m` to any point of a body."""
-    return np.sort(_near_rows(tree, body, float(radius_m)))
+    return np.sort(rows_near(tree, body, float(radius_m)))
 
 
 def counts_around(
@@ -53,6 +53,11 @@ def counts_around(
     kernel = _counts_in_chunks if len(points) > CHUNK else _counts_around
     kernel(tree, before, np.ascontiguousarray(points), float(radius_m), counts)
     return counts
+
+
+def number_around(tree: Tree, points: np.ndarray, radius_m: float) -> np.ndarray:
+    """How many (K,) of the tree's points lie within `radius_m` of each of points (K, 3)."""
+    return _number_around(tree, np.ascontiguousarray(points), float(radius_m))
 
 
 def any_within(tree: Tree, points: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
@@ -76,6 +81,17 @@ def _query(tree, points, reach_m, distance_m, row):
 
 
 @njit(parallel=True)
+def _nearest_m(tree, points, known_m, reach_m):
+    distance_m = known_m.copy()
+    for i in numba.prange(len(points)):
+        bound_m = min(known_m[i], reach_m)
+        place, apart_sq = nearest(tree, points[i, 0], points[i, 1], points[i, 2], bound_m * bound_m, -1)
+        if place >= 0:
+            distance_m[i] = math.sqrt(apart_sq)
+    return distance_m
+
+
+@njit(parallel=True)
 def _any_within(tree, points, reach_m):
     found = np.zeros(len(points), np.bool_)
     for i in numba.prange(len(points)):
@@ -84,7 +100,8 @@ def _any_within(tree, points, reach_m):
 
 
 @njit()
-def _near_rows(tree, body, radius_m):
+def rows_near(tree, body, radius_m):
+    """As `near_rows`, in the order of the tree, for other kernels."""
     found, count = np.empty(len(tree.rows), np.int64), 0
     leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
     waiting = np.empty(DEPTH, np.int64)
@@ -179,3 +196,27 @@ def _counts_around(tree, before, points, radius_m, counts):
                     if distance_sq(tree.points, i, x, y, z) <= radius_sq:
                         for mark in range(counts.shape[1]):
                             counts[k, mark] += before[i + 1, mark] - before[i, mark]
+
+
+@njit()
+def _number_around(tree, points, radius_m):
+    leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
+    waiting, numbers = np.empty(DEPTH, np.int64), np.zeros(len(points), np.int64)
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        waiting[0], depth = 0, 1
+        while depth > 0:
+            depth -= 1
+            node = waiting[depth]
+            if box_distance_sq(tree, node, x, y, z) > radius_sq:
+                continue
+            start, end = tree.starts[node], tree.ends[node]
+            if _farthest_sq(tree, node, points, k) <= radius_sq:
+                numbers[k] += end - start
+            elif node < leaves:
+                waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2
+                depth += 2
+            else:
+                for i in range(start, end):
+                    numbers[k] += distance_sq(tree.points, i, x, y, z) <= radius_sq
+    return numbers

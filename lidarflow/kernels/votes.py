@@ -25,6 +25,16 @@ def mode(shifts, radius_m):
     return mean
 
 
+@njit()
+def median(shifts):
+    """Median (3,) of the shifts (K, 3) along each axis."""
+    middle, half = np.empty(3), len(shifts) // 2
+    for k in range(3):
+        ordered = np.sort(shifts[:, k])
+        middle[k] = ordered[half] if len(shifts) % 2 else (ordered[half - 1] + ordered[half]) / 2.0
+    return middle
+
+
 @njit(inline="always")
 def _apart_sq(shifts, i, j):
     dx, dy, dz = shifts[i, 0] - shifts[j, 0], shifts[i, 1] - shifts[j, 1], shifts[i, 2] - shifts[j, 2]

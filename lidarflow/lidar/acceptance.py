@@ -4,7 +4,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import ground_plane, neighbours, tree
+from lidarflow.kernels import ground_plane, neighbours, tree, votes
 from lidarflow.lidar.body import Body, near_rows
 from lidarflow.lidar.evidence import tolerance
 from lidarflow.lidar.surface import CAP_M, misfit_after
@@ -98,7 +98,7 @@ def _matches_agree(view: View, body: Body, shift: np.ndarray, config: ObjectsCon
     if on_body.sum() < max(config.min_matches, 1):
         return config.min_matches == 0
     points, match_shift = view.points[view.match_rows[on_body]], view.match_shift[on_body]
-    off = np.median(points + match_shift - pose.apply(body.over_ground, points), axis=0)
+    off = votes.median(points + match_shift - pose.apply(body.over_ground, points))
     return np.hypot(off[0], off[1]) <= min(config.max_match_deviation * np.hypot(shift[0], shift[1]), CAP_M)
 
 

@@ -55,14 +55,14 @@ class Search:
     count     int          points of the source
     rows      (U,) int64   those of them that the view has
     view      View         without matches
-    expected  tuple        what earlier pairs lead to expect
+    expected  Expected     what earlier pairs lead to expect
     seeds     Seeds
     """
 
     count: int
     rows: np.ndarray
     view: View
-    expected: tuple[Expected, ...]
+    expected: Expected
     seeds: Seeds
 
     def near(self, reach_m: float) -> np.ndarray:
@@ -80,7 +80,7 @@ def search(
     moved = source.cloud.moved(ego_motion, config.shot.surface_voxel_m, config.normals.radius_m)
     view = view_of_pair.look(moved, target.cloud, config.objects)
     expected = _expected(tracks, ego_motion)
-    found = seeds.find(view, [e.points for e in expected], config.objects)
+    found = seeds.find(view, expected.points, config.objects)
     rows = np.flatnonzero(source.usable & ~source.ground)
     return Search(len(source.usable), rows, view, expected, found)
 
@@ -115,14 +115,14 @@ def attribute(
         tracking.advance(tracks, ids, clouds, over_ground, ego_motion))
 
 
-def _expected(tracks: Tracks, ego_motion: np.ndarray) -> tuple[Expected, ...]:
+def _expected(tracks: Tracks, ego_motion: np.ndarray) -> Expected:
     """What the tracks lead to expect, in the frame of the view: that of the target."""
-    expected = []
-    for track in tracks.followed:
-        points = pose.apply(ego_motion, track.points)
-        moved = pose.apply(track.goes_on(ego_motion), points)
-        expected.append(Expected(tree.build(points), (moved - points).mean(axis=0)))
-    return tuple(expected)
+    clouds = [pose.apply(ego_motion, track.points) for track in tracks.followed]
+    shifts = [(pose.apply(track.goes_on(ego_motion), points) - points).mean(axis=0)
+              for track, points in zip(tracks.followed, clouds, strict=True)]
+    number = np.repeat(np.arange(len(clouds)), [len(points) for points in clouds])
+    points = np.concatenate([np.empty((0, 3)), *clouds])
+    return Expected(tree.build(points), number, np.array(shifts).reshape(-1, 3))
 
 
 def _std(

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarflow.config import ObjectsConfig
-from lidarflow.kernels import grid, ground_plane, links, neighbours, tree
+from lidarflow.kernels import growth, neighbours, tree
 from lidarflow.lidar import rigid_fit
+from lidarflow.lidar.surface import CAP_M, MIN_AGREEMENT
 from lidarflow.lidar.view import View
 
 _LINK_M = 0.5            # points of one body hang together at this distance
@@ -17,11 +18,11 @@ _CLEARLY_BETTER_M = 0.02
 _AS_GOOD_M = 0.03
 _SURROUND_M = 0.35       # whose neighbours at this distance are mostly of the body belongs to it
 _FRAGMENT_M = 1.0        # a fragment this near that follows the body belongs to it: glass returns nothing
-_FIT_VOXEL_M = 0.12
-_THIN_FIT_POINTS = 40
-_SLOPE_RADIUS_M = 5.0
-_MIN_SLOPE_POINTS = 20
-_MAX_SLOPE = 0.2
+# A body is thinned to fit its motion, which goes along the ground around, if enough of it is seen.
+_FIT = growth.Fit(
+    voxel_m=0.12, voxel_points=40, slope_radius_m=5.0, min_slope_points=20, max_slope=0.2, along_ground=0.0,
+    plane_scale_m=rigid_fit.PLANE_SCALE_M, point_scale_m=rigid_fit.POINT_SCALE_M,
+    point_weight=rigid_fit.POINT_WEIGHT)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,50 +37,45 @@ class Body:
     over_ground: np.ndarray
 
 
-def grown(
-    view: View, seed: np.ndarray, over_ground: np.ndarray, free: np.ndarray, config: ObjectsConfig
-) -> Body | None:
-    """The body around the rows `seed`: what hangs together with them and agrees; None if too small.
+@dataclass(frozen=True, slots=True, eq=False)
+class Growth:
+    """How a body grew.
 
-    Only rows that are `free` (N,) may be taken.
+    body   Body or None   None if it stayed too small
+    asked  (N,) bool      the rows of the view that were asked whether they agree
+    """
+
+    body: Body | None
+    asked: np.ndarray
+
+
+def grown(
+    view: View, seeds: list[np.ndarray], starts: list[np.ndarray], free: np.ndarray, config: ObjectsConfig
+) -> list[Growth]:
+    """The bodies around `seeds`, rows (K,) each, that move by about `starts` (4, 4), each as if alone.
+
+    A body looks at what is near to its seeds, keeps what agrees with its motion and hangs together with a
+    seed, fits the motion to that, and looks around again, until it comes near nothing new. Only rows that are
+    `free` (N,) may be taken.
 
     The side of a car that moves along itself is explained by either motion, and belongs to the car when
-    the car's motion explains it about as well.
+    the car's motion explains it about as well: a row agrees that the motion explains clearly better, or in
+    place and about as well.
     """
-    is_seed, is_near = np.zeros((2, len(view.points)), bool)
-    is_seed[seed] = True
-    near = near_rows(view, seed, _FIRST_REACH_M)
-    body = None
-    for _ in range(_GROWTH_ROUNDS):
-        rows = near[free[near]]
-        rows = rows[_agrees(view, rows, over_ground)]
-        if len(rows) < config.min_points:
-            return None
-        label = links.components(view.points[rows], _LINK_M)
-        holds_seed = np.zeros(len(rows), bool)   # by label
-        holds_seed[label[is_seed[rows]]] = True
-        rows = rows[holds_seed[label]]
-        if len(rows) < config.min_points:
-            return None
-        over_ground = fitted(view, rows, over_ground, config)
-        body = Body(rows, over_ground)
-        is_near[near] = True
-        is_near[near_rows(view, rows, _REACH_M)] = True
-        wider = np.flatnonzero(is_near)
-        if len(wider) == len(near):
-            break
-        near = wider
-    return body
-
-
-def fitted(view: View, rows: np.ndarray, start: np.ndarray, config: ObjectsConfig) -> np.ndarray:
-    """Motion (4, 4) of the points at `rows` onto the target's planes, from `start` (4, 4)."""
-    if len(rows) > _THIN_FIT_POINTS:
-        rows = rows[grid.first_per_voxel(view.points[rows], _FIT_VOXEL_M)]
-    points = view.points[rows]
-    return rigid_fit.onto_planes(
-        points, view.source.normals[rows], view.upright, start,
-        _ground_normal(view, points.mean(axis=0)), config.along_ground)
+    if not seeds:
+        return []
+    own = growth.Points(
+        view.points, view.source.normals, view.tolerance_m, view.by_ego.distance_m, view.by_ego.plane_m)
+    limits = growth.Limits(
+        _FIRST_REACH_M, _REACH_M, _GROWTH_ROUNDS, config.min_points, _LINK_M, _CLEARLY_BETTER_M, _AS_GOOD_M,
+        CAP_M, MIN_AGREEMENT)
+    did, motions = growth.grow_each(
+        *rigid_fit.concatenated(seeds), np.stack(starts), free, view.source.tree, own, view.upright.tree,
+        view.upright.normals, view.ground, limits, _FIT._replace(along_ground=float(config.along_ground)),
+        rigid_fit.PLANE_GATES_M)
+    taken = [np.flatnonzero(own_did == growth.TAKEN) for own_did in did]
+    return [Growth(Body(rows, motion) if len(rows) else None, own_did > 0)
+            for rows, motion, own_did in zip(taken, motions, did, strict=True)]
 
 
 def completed(view: View, body: Body, free: np.ndarray) -> Body:
@@ -111,28 +107,7 @@ def near_rows(view: View, rows: np.ndarray, radius_m: float) -> np.ndarray:
 
 def _surrounded(view: View, on_body: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Whether (K,) most neighbours of each of `rows` are on the body."""
-    marks = np.column_stack([on_body, ~on_body])
-    of_body, others = neighbours.counts_around(view.source.tree, marks, view.points[rows], _SURROUND_M).T
+    body, points = tree.build(view.points[on_body]), view.points[rows]
+    of_body = neighbours.number_around(body, points, _SURROUND_M)
+    others = neighbours.number_around(view.source.tree, points, _SURROUND_M) - of_body
     return of_body - on_body[rows] > others - ~on_body[rows]   # the point itself has no say
-
-
-def _agrees(view: View, rows: np.ndarray, over_ground: np.ndarray) -> np.ndarray:
-    """Whether (K,) the motion explains the points at `rows` clearly better, or in place and about as well."""
-    own = view.after(rows, over_ground)
-    ego_m, ego_plane_m = view.by_ego.distance_m[rows], view.by_ego.plane_m[rows]
-    fits = own.distance_m <= view.tolerance_m[rows]
-    better = own.distance_m < ego_m - _CLEARLY_BETTER_M
-    plane_better = fits & (own.plane_m < ego_plane_m - _AS_GOOD_M)
-    as_good = fits & (own.distance_m < ego_m + _AS_GOOD_M) & (own.plane_m < ego_plane_m + _CLEARLY_BETTER_M)
-    plane_worse = (own.plane_m > ego_plane_m + _AS_GOOD_M) & ~better
-    return (better | plane_better | as_good) & ~plane_worse
-
-
-def _ground_normal(view: View, centre: np.ndarray) -> np.ndarray:
-    """Unit normal (3,) of the ground around `centre` (3,), upright where too little of it is seen."""
-    up = np.array([0.0, 0.0, 1.0])
-    rise_x, rise_y, count = ground_plane.slope(view.ground, centre, _SLOPE_RADIUS_M)
-    if count < _MIN_SLOPE_POINTS or np.hypot(rise_x, rise_y) > _MAX_SLOPE:
-        return up
-    normal = np.array([-rise_x, -rise_y, 1.0])
-    return normal / np.linalg.norm(normal)

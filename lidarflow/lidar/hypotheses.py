@@ -22,18 +22,23 @@ _MIN_SHIFTED = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """An object that earlier pairs lead to expect.
+    """The objects that earlier pairs lead to expect.
 
-    points  Tree    over its points (K, 3) where they should be before they move, in the frame of the view
-    shift   (3,)    what it should do over ground, metres
+    points  Tree        over all their points (K, 3), where they should be before they move, frame of the view
+    number  (K,) int64  of the object that each point is on
+    shifts  (E, 3)      what the objects should do over ground, metres
     """
 
     points: Tree
-    shift: np.ndarray
+    number: np.ndarray
+    shifts: np.ndarray
+
+
+NONE = Expected(tree.NOTHING, np.empty(0, np.int64), np.empty((0, 3)))
 
 
 def translations(
-    view: View, rows: np.ndarray, shift: np.ndarray, expected: tuple[Expected, ...], max_shift_m: float
+    view: View, rows: np.ndarray, shift: np.ndarray, expected: Expected, max_shift_m: float
 ) -> list[np.ndarray]:
     """Translations over ground (3,), metres, of the seeds at `rows` (K,), whose planes tell shifts (K, 3)."""
     points = view.points[rows]
@@ -54,18 +59,19 @@ def _of_matches(view: View, body: Tree) -> list[np.ndarray]:
     shifts = view.match_shift[neighbours.near_rows(view.matched, body, _MATCH_RADIUS_M)]
     if len(shifts) < _MIN_MATCHES:
         return []
-    return [votes.mode(shifts, _MATCH_MODE_M), np.median(shifts, axis=0)]
+    return [votes.mode(shifts, _MATCH_MODE_M), votes.median(shifts)]
 
 
 def _of_planes(shift: np.ndarray) -> list[np.ndarray]:
     """The median of the shifts that planes tell."""
     known = shift[np.isfinite(shift[:, 0])]
-    return [np.median(known, axis=0)] if len(known) >= _MIN_SHIFTED else []
+    return [votes.median(known)] if len(known) >= _MIN_SHIFTED else []
 
 
-def _of_expected(body: Tree, expected: tuple[Expected, ...]) -> list[np.ndarray]:
+def _of_expected(body: Tree, expected: Expected) -> list[np.ndarray]:
     """The shifts of the expected objects that these points may be on."""
-    return [e.shift for e in expected if len(neighbours.near_rows(e.points, body, _EXPECTED_RADIUS_M))]
+    near = neighbours.near_rows(expected.points, body, _EXPECTED_RADIUS_M)
+    return list(expected.shifts[np.unique(expected.number[near])])
 
 
 def _of_votes(view: View, points: np.ndarray, body: Tree, max_shift_m: float) -> list[np.ndarray]:

@@ -20,7 +20,7 @@ _MAX_START_POINTS = 300  # as many choose the start; the fit that follows uses a
 
 def find(
     view: View, found: seeds.Seeds, dt_s: float, config: ObjectsConfig,
-    expected: tuple[hypotheses.Expected, ...] = (),
+    expected: hypotheses.Expected = hypotheses.NONE,
 ) -> list[Body]:
     """The moving objects of a view, sought at seeds; no point belongs to two, the best supported come first.
 
@@ -29,20 +29,29 @@ def find(
     """
     starts = _best_starts(view, found, found.clusters, expected)
     bodies, free = [], np.ones(len(view.points), bool)
-    for cluster, start in zip(found.clusters, starts, strict=True):
+    # All grow at once, as if each were alone; who meets what another has taken grows again.
+    moving = [number for number, start in enumerate(starts) if start is not None]
+    alone = dict(zip(moving, body.grown(
+        view, [found.rows[found.clusters[number]] for number in moving],
+        [starts[number] for number in moving], free, config), strict=True))
+    taken = np.empty(0, np.int64)
+    for number, (cluster, start) in enumerate(zip(found.clusters, starts, strict=True)):
         mine = cluster[free[found.rows[cluster]]]
         if len(mine) < len(cluster):
             start, = _best_starts(view, found, (mine,), expected)
         if start is None:
             continue
-        grown = body.grown(view, found.rows[mine], start, free, config)
-        if grown is None or not moves(view, grown, dt_s, config):
+        grown = alone.get(number)
+        if grown is None or len(mine) < len(cluster) or grown.asked[taken].any():
+            grown, = body.grown(view, [found.rows[mine]], [start], free, config)
+        if grown.body is None or not moves(view, grown.body, dt_s, config):
             continue
-        whole = body.completed(view, grown, free)
+        whole = body.completed(view, grown.body, free)
         # What a body surrounds must not speak against it.
         if moves(view, whole, dt_s, config):
             bodies.append(whole)
             free[whole.rows] = False
+            taken = np.flatnonzero(~free)
     return bodies
 
 
@@ -61,7 +70,7 @@ def describe(
 
 def _best_starts(
     view: View, found: seeds.Seeds, clusters: tuple[np.ndarray, ...],
-    expected: tuple[hypotheses.Expected, ...],
+    expected: hypotheses.Expected,
 ) -> list[np.ndarray | None]:
     """For each cluster of seeds, the motion (4, 4) that explains it best, from what is proposed for it.
 

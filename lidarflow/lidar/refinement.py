@@ -12,14 +12,14 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import RefineConfig, SolverConfig
-from lidarflow.kernels import neighbours
+from lidarflow.kernels import neighbours, tree, triangles
 from lidarflow.kernels.tree import Tree
+from lidarflow.kernels.triangles import Triangles
 from lidarflow.lidar.mesh import Mesh
-from lidarflow.open3d_import import open3d
 from lidarflow.types import FlowProblem
 
 _TOLERANCE = 1e-2  # a gain smaller than this share ends a solution
-_MARGIN_M = 3.0   # around the things that are refined: what they may reach within a pair
+_MARGIN_M = 1.5   # around where refined things begin: what their limbs may reach
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,38 +29,31 @@ class Surface:
     The nearest return is no measure of where a surface is: rings lie far apart and travel with the sensor,
     and what is pulled to the nearest of them is pulled along the surface. Triangles fill the gaps.
 
-    upright    Tree                        of the points, for those without a triangle
-    triangles  RaycastingScene or None     None without triangles
+    triangles  Triangles
+    lone       Tree        over the points that no triangle has
     """
 
-    upright: Tree
-    triangles: object
+    triangles: Triangles
+    lone: Tree
 
     @classmethod
-    def around(cls, places: np.ndarray, points: np.ndarray, upright: Tree, mesh: Mesh) -> "Surface":
-        """Of a scan's points (N, 3), metres, those that stand upright, and its mesh around places (M, 3)."""
-        with np.errstate(invalid="ignore"):
-            inside = (points >= places.min(axis=0) - _MARGIN_M) & (points <= places.max(axis=0) + _MARGIN_M)
-        near = inside.all(axis=1)
-        triangles = mesh.triangles[near[mesh.triangles].all(axis=1)]
-        scene = None
-        if len(triangles):
-            o3d = open3d()
-            scene = o3d.t.geometry.RaycastingScene()
-            vertices = np.where(near[:, None], points, 0.0)   # no triangle uses the others
-            scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)),
-                                o3d.core.Tensor(triangles.astype(np.uint32)))
-        return cls(upright, scene)
+    def around(
+        cls, places: np.ndarray, points: np.ndarray, rows: np.ndarray, upright: Tree, mesh: Mesh
+    ) -> "Surface":
+        """Of a scan's points (N, 3), metres, and its mesh, what may be reached from places (M, 3).
 
-    def nearest(self, points: np.ndarray) -> np.ndarray:
-        """Nearest places (N, 3) on the surface to points (N, 3), metres; NaN where there is none."""
-        places, off_m = neighbours.nearest_points(self.upright, points)
-        if self.triangles is None:
-            return places
-        query = open3d().core.Tensor(points.astype(np.float32))
-        on_triangles = self.triangles.compute_closest_points(query)["points"].numpy().astype(np.float64)
-        nearer = np.linalg.norm(on_triangles - points, axis=1) < off_m
-        return np.where(nearer[:, None], on_triangles, places)
+        rows (U,) are those of the points that stand upright and that the tree is over.
+        """
+        near = np.zeros(len(points), bool)
+        near[rows[neighbours.near_rows(upright, tree.build(places), _MARGIN_M)]] = True
+        a, b, c = mesh.triangles.T
+        kept = mesh.triangles[near[a] | near[b] | near[c]]
+        near[kept] = False
+        return cls(triangles.build(points[kept]), tree.build(points[near]))
+
+    def nearest(self, points: np.ndarray, reach_m: float) -> np.ndarray:
+        """Nearest places (N, 3) on the surface to points (N, 3), metres; NaN where none is within reach."""
+        return triangles.nearest(self.triangles, self.lone, points, reach_m)
 
 
 def refined(
@@ -92,8 +85,8 @@ def rematched(problem: FlowProblem, motions: np.ndarray, surface: Surface, reach
     Places farther than `reach_m` say nothing.
     """
     moved = pose.apply(motions, problem.points)
-    places = surface.nearest(moved)
-    near = np.flatnonzero(np.linalg.norm(places - moved, axis=1) <= reach_m).astype(np.int32)
+    places = surface.nearest(moved, reach_m)
+    near = np.flatnonzero(np.isfinite(places[:, 0])).astype(np.int32)
     return replace(problem, initial=motions, match_index=near, match_target=places[near])
 
 

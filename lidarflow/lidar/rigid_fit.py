@@ -2,17 +2,20 @@
 
 import numpy as np
 
-from lidarflow import pose
 from lidarflow.kernels import icp
 from lidarflow.kernels.tree import Tree
-from lidarflow.lidar.surface import MIN_AGREEMENT, Surface
 
 _GATES_M = np.array([1.0, 0.5, 0.3])   # how far a point may be from its counterpart, coarse to fine
 _ROUNDS_PER_GATE = 5
-_PLANE_GATES_M = np.array([0.5] * 5 + [0.3] * 10)
-_PLANE_SCALE_M = 0.05        # plane distances beyond it lose weight
-_POINT_SCALE_M = 0.15        # and distances between points beyond this
-_POINT_WEIGHT = 0.05         # of a pair of points, where the plane of the same pair has 1
+
+# Onto planes, by robust point-to-plane ICP (icp.onto_planes): rings of a spinning sensor stand still on a
+# body that moves under them; nearest points follow the rings, planes do not. A small weight on the points
+# themselves holds what no plane does. What drives or walks moves along the ground: the shift along the
+# ground's normal is held back with `along_ground` times the weight of all pairs.
+PLANE_GATES_M = np.array([0.5] * 5 + [0.3] * 10)
+PLANE_SCALE_M = 0.05        # plane distances beyond it lose weight
+POINT_SCALE_M = 0.15        # and distances between points beyond this
+POINT_WEIGHT = 0.05         # of a pair of points, where the plane of the same pair has 1
 
 
 def onto(
@@ -27,25 +30,6 @@ def onto(
         *concatenated(groups), np.array([group for group, _ in starts], np.int64),
         np.array([translation for _, translation in starts], float).reshape(-1, 3), target, _GATES_M,
         _ROUNDS_PER_GATE)
-
-
-def onto_planes(
-    points: np.ndarray, normals: np.ndarray, target: Surface, start: np.ndarray, up: np.ndarray,
-    along_ground: float,
-) -> np.ndarray:
-    """Motion (4, 4) of points (N, 3) with normals (N, 3) onto a surface, by robust point-to-plane ICP.
-
-    Rings of a spinning sensor stand still on a body that moves under them; nearest points follow the rings,
-    planes do not. A small weight on the points themselves holds what no plane does. What drives or walks
-    moves along the ground: the shift along its normal `up` (3,) is held back with `along_ground` times the
-    weight of all pairs. Turns are about the vertical; `start` (4, 4) is one.
-    """
-    centre = points.mean(axis=0)
-    turn = float(np.arctan2(start[1, 0], start[0, 0]))
-    shift = pose.apply(start, centre) - centre
-    return icp.onto_planes(
-        points, normals, target.tree, target.normals, turn, shift, _PLANE_GATES_M, up, float(along_ground),
-        _PLANE_SCALE_M, _POINT_SCALE_M, _POINT_WEIGHT, MIN_AGREEMENT)
 
 
 def concatenated(groups: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

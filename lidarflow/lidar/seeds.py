@@ -38,18 +38,17 @@ class Seeds:
         return self.rows[np.concatenate(self.clusters)] if self.clusters else self.rows[:0]
 
 
-def find(view: View, expected: list[Tree], config: ObjectsConfig) -> Seeds:
+def find(view: View, expected: Tree, config: ObjectsConfig) -> Seeds:
     """Unexplained points amid unexplained ones, and points whose surface is shifted as one.
 
     The first finds what moves by more than the spacing of points, the second what moves by less: on leaves,
-    plane distances point all ways and no shift explains them. Where objects are `expected`, given as trees
-    of points, everything is a seed.
+    plane distances point all ways and no shift explains them. Where objects are `expected`, given as a tree
+    of their points, everything is a seed.
     """
     left = _left_behind(view)
     shifted, shift = _shifted(view, config)
     rows = np.union1d(left, shifted)
-    for body in expected:
-        rows = np.union1d(rows, neighbours.near_rows(view.source.tree, body, _EXPECTED_RADIUS_M))
+    rows = np.union1d(rows, neighbours.near_rows(view.source.tree, expected, _EXPECTED_RADIUS_M))
     shift_of = np.full((len(rows), 3), np.nan)
     shift_of[np.searchsorted(rows, shifted)] = shift
     return Seeds(rows, shift_of, _clusters(view.points[rows]))
@@ -82,7 +81,7 @@ def _shifted(view: View, config: ObjectsConfig) -> tuple[np.ndarray, np.ndarray]
     planes[agrees] = view.upright.normals[view.at_rest.row[rows[agrees]]]
     offsets_m[agrees] = view.at_rest.offset_m[rows[agrees]]
     shift, count, before_m, after_m = coherence.local_shifts(
-        view.points[rows], planes, offsets_m, _NEIGHBOURHOOD_M)
+        view.points[rows], planes, offsets_m, _NEIGHBOURHOOD_M, _MIN_PLANES, _MIN_RMS_M)
     explained = after_m**2 <= (1.0 - _MIN_COHERENCE) * before_m**2
     shifted = (count >= _MIN_PLANES) & (before_m >= _MIN_RMS_M) & explained
     shifted &= np.linalg.norm(shift, axis=1) >= config.min_shift_m

@@ -1,0 +1,174 @@
+"""Moving bodies grown from seeds, each by itself, so that all can grow at once."""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from lidarflow.kernels import grid, ground_plane, icp, links, misfit, neighbours
+from lidarflow.kernels import tree as trees
+from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.linalg import moved
+
+ASKED, TAKEN = 1, 2   # what growth did with a row; 0 for those it never came near
+
+
+class Points(NamedTuple):
+    """Points that bodies grow over.
+
+    points       (N, 3) float64
+    normals      (N, 3) float64   NaN where unknown
+    tolerance_m  (N,) float64     how far they may be from the target and still be explained
+    by_ego_m     (N,) float64     how far they are from it, at most the cap, without moving,
+    by_ego_plane_m  (N,) float64  and from its planes
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    tolerance_m: np.ndarray
+    by_ego_m: np.ndarray
+    by_ego_plane_m: np.ndarray
+
+
+class Limits(NamedTuple):
+    """How bodies grow; metres.
+
+    first_reach_m, reach_m, rounds   how far from its seeds, then from itself, a body looks, and how often
+    min_points, link_m               a body hangs together at this distance, and has so many points
+    clearly_better_m, as_good_m      differences between distances that count, and that do not
+    cap_m, min_agreement             of distances, as in misfit.after
+    """
+
+    first_reach_m: float
+    reach_m: float
+    rounds: int
+    min_points: int
+    link_m: float
+    clearly_better_m: float
+    as_good_m: float
+    cap_m: float
+    min_agreement: float
+
+
+class Fit(NamedTuple):
+    """How motions are fitted to planes: as in icp.onto_planes, after thinning to voxels and along the ground.
+
+    voxel_m, voxel_points                        more points than these are thinned to such voxels
+    slope_radius_m, min_slope_points, max_slope  where, and of what, the ground's slope is believed
+    """
+
+    voxel_m: float
+    voxel_points: int
+    slope_radius_m: float
+    min_slope_points: int
+    max_slope: float
+    along_ground: float
+    plane_scale_m: float
+    point_scale_m: float
+    point_weight: float
+
+
+@njit(parallel=True)
+def grow_each(
+    seeds, bounds, starts, free, source, own, target, target_normals, ground, limits, fit, gates_m
+):
+    """What each of H growths did with each row (H, N) uint8, and the motions (H, 4, 4) of the bodies.
+
+    Growth h begins at the rows seeds[bounds[h]: bounds[h + 1]] with the motion starts[h]; only rows that are
+    `free` (N,) are taken. One that stays too small takes none. `source` is the tree over `own`, the others
+    are of the surface that bodies move onto and of its ground.
+    """
+    did = np.zeros((len(starts), len(own.points)), np.uint8)
+    motions = starts.copy()
+    for h in numba.prange(len(starts)):
+        _grow(seeds[bounds[h]: bounds[h + 1]], free, source, own, target, target_normals, ground, limits, fit,
+              gates_m, did[h], motions[h])
+    return did, motions
+
+
+@njit()
+def _grow(
+    seed, free, source, own, target, target_normals, ground, limits, fit, gates_m, did, motion
+):
+    is_seed = np.zeros(len(did), np.bool_)
+    is_seed[seed] = True
+    rows, reach_m = seed, limits.first_reach_m
+    asked = 0
+    for _ in range(limits.rounds):
+        for row in neighbours.rows_near(source, trees.grown(own.points[rows]), reach_m):
+            did[row] = ASKED
+        near = np.flatnonzero(did)
+        if len(near) == asked:
+            break
+        asked, reach_m = len(near), limits.reach_m
+        rows = _agreeing(near, free, motion, own, target, target_normals, ground, limits)
+        if len(rows) >= limits.min_points:
+            rows = _hanging_together(rows, own.points, is_seed, limits.link_m)
+        if len(rows) < limits.min_points:
+            return
+        _fit(rows, own, target, target_normals, ground, limits, fit, gates_m, motion)
+    did[rows] = TAKEN
+
+
+@njit()
+def _agreeing(near, free, motion, own, target, target_normals, ground, limits):
+    """The free ones of the rows that the motion explains clearly better, or in place and about as well."""
+    rows, count = np.empty(len(near), np.int64), 0
+    better_m, as_good_m = limits.clearly_better_m, limits.as_good_m
+    for row in near:
+        if not free[row]:
+            continue
+        ego_m, ego_plane_m = own.by_ego_m[row], own.by_ego_plane_m[row]
+        own_m, plane_m = misfit.after_one(
+            own.points[row], own.normals[row], motion, target, target_normals, ground, limits.cap_m,
+            limits.min_agreement)
+        fits = own_m <= own.tolerance_m[row]
+        better = own_m < ego_m - better_m
+        plane_better = fits and plane_m < ego_plane_m - as_good_m
+        as_good = fits and own_m < ego_m + as_good_m and plane_m < ego_plane_m + better_m
+        plane_worse = plane_m > ego_plane_m + as_good_m and not better
+        if (better or plane_better or as_good) and not plane_worse:
+            rows[count] = row
+            count += 1
+    return rows[:count]
+
+
+@njit()
+def _hanging_together(rows, points, is_seed, link_m):
+    """Those of the rows that steps of `link_m` lead to from a seed among them."""
+    label = links.joined(points[rows], link_m)
+    holds_seed = np.zeros(len(rows), np.bool_)   # by label
+    for i in range(len(rows)):
+        if is_seed[rows[i]]:
+            holds_seed[label[i]] = True
+    return rows[holds_seed[label]]
+
+
+@njit()
+def _fit(rows, own, target, target_normals, ground, limits, fit, gates_m, motion):
+    """Bring `motion` (4, 4) to that of the rows onto the target's planes."""
+    points = own.points[rows]
+    if len(rows) > fit.voxel_points:
+        rows = rows[np.sort(grid._first_per_voxel(points, fit.voxel_m))]
+        points = own.points[rows]
+    centre = icp.mean(points)
+    x, y, z = moved(centre, motion)
+    shift = np.array([x - centre[0], y - centre[1], z - centre[2]])
+    motion[:] = icp.onto_planes(
+        points, own.normals[rows], target, target_normals, math.atan2(motion[1, 0], motion[0, 0]), shift,
+        gates_m, _ground_normal(ground, centre, fit), fit.along_ground, fit.plane_scale_m, fit.point_scale_m,
+        fit.point_weight, limits.min_agreement)
+
+
+@njit()
+def _ground_normal(ground, centre, fit):
+    """Unit normal (3,) of the ground around `centre` (3,), upright where too little of it is seen."""
+    rise_x, rise_y, count = ground_plane.slope(ground, centre, fit.slope_radius_m)
+    normal = np.array([-rise_x, -rise_y, 1.0])
+    if count < fit.min_slope_points or math.hypot(rise_x, rise_y) > fit.max_slope:
+        normal[0] = normal[1] = 0.0
+    length = math.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + 1.0)
+    for k in range(3):
+        normal[k] /= length
+    return normal
