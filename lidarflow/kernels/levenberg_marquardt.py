@@ -9,11 +9,11 @@ from lidarflow.kernels import multigrid, pose_graph, twist_errors
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.hierarchy import weigh
 
-# Where an iteration gains less than relative_tolerance of the energy, or absolute_tolerance, it is the last.
-# The others are those of multigrid.solve.
+# Where an iteration gains less than relative_tolerance of the energy, or absolute_tolerance, it is the last,
+# unless the kernel let go or took back a match or a tie: then the next one may gain more. The others are
+# those of multigrid.solve.
 Limits = namedtuple("Limits", (
-    "max_iterations", "relative_tolerance", "absolute_tolerance", "step_tolerance", "max_products",
-    "correction"))
+    "max_iterations", "relative_tolerance", "absolute_tolerance", "step_tolerance", "max_products"))
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-5, 1e5, 10.0    # as in gtsam
 _SURELY_LESS = 0.03    # a cycle foresees at least this share of what there is to gain
 FIGURES = 5            # iterations, first energy, last energy, whether the limit was reached, products
@@ -85,11 +85,11 @@ def _step(factors, hierarchy, room, c, nodes, edges, limits, state, block, robus
         least = max(limits.relative_tolerance * energy, limits.absolute_tolerance)
         products = multigrid.solve(
             hierarchy, room, c, state.gradients[here], limits.step_tolerance, _SURELY_LESS * least,
-            limits.max_products, limits.correction)
-        figures[4] += products
-        if products == 0:
+            limits.max_products)
+        if products < 0:
             figures[0] += 1
             break
+        figures[4] += products
         pose_graph.step(variables, nodes, room.step, trials)
         there = 1 - here
         trial_smooth = pose_graph.smoothness(factors, trials, nodes, edges, block, state.smoothness[there])
@@ -102,8 +102,9 @@ def _step(factors, hierarchy, room, c, nodes, edges, limits, state, block, robus
         figures[0] += 1
         damping = max(damping / _DAMPING_FACTOR, _FIRST_DAMPING)
         variables[first:last] = trials[first:last]
+        settled = np.array_equal(active[here, first:last], active[there, first:last])
         energy, smooth, here = found, trial_smooth, there
-        if gained < least:
+        if gained < least and settled:
             break
     figures[2] = energy
     figures[3] = figures[0] >= limits.max_iterations

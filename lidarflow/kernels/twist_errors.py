@@ -1,8 +1,8 @@
 """Errors between pairs of poses, a block of pairs at a time.
 
-A block is a flat array of rows of WIDTH numbers, a row for each number that is given of a pair or found. Loops
-along rows have neither branches nor unknown distances between what they read and what they write, so that
-the compiler makes vector instructions of them.
+A block is a flat array of rows of WIDTH numbers, a row for each number that is given of a pair or found.
+Loops along rows have neither branches nor unknown distances between what they read and what they write, so
+that the compiler makes vector instructions of them.
 """
 
 import numpy as np

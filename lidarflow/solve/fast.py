@@ -15,9 +15,8 @@ from lidarflow.kernels import hierarchy, levenberg_marquardt, multigrid, pose_gr
 from lidarflow.solve import common
 from lidarflow.types import FlowProblem, SolveStats
 
-_STEP_TOLERANCE = 0.03    # conjugate gradients stop at an iteration that adds less than this to their gain
+_STEP_TOLERANCE = 0.03    # conjugate gradients stop where less than this is left to add to their gain
 _MAX_PRODUCTS = 50
-_CORRECTION = 1.8         # aggregates are too stiff: coarse steps are lengthened (Braess 1995)
 
 
 def solve(
@@ -65,7 +64,7 @@ def _optimise(
     shares, share_bounds = _shares(counts)
     limits = levenberg_marquardt.Limits(
         config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE, _STEP_TOLERANCE,
-        _MAX_PRODUCTS, _CORRECTION)
+        _MAX_PRODUCTS)
     figures = levenberg_marquardt.optimise_each(
         factors, levels, multigrid.room_for(levels), edge_bounds, shares, share_bounds, limits,
         levenberg_marquardt.state_at(variables))
