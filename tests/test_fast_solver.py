@@ -48,7 +48,7 @@ def linearised(problem, config: SolverConfig, robust: bool):
     count = len(problem.points)
     edges = problem.edges[np.lexsort(problem.edges.T[::-1])]
     factors = fast.factors_of(problem, np.arange(count), np.arange(count), problem.points, edges, config)
-    variables = pose_graph.variables_of(problem.initial, problem.points)
+    variables = pose_graph.variables_of(problem.initial, np.arange(count), problem.points)
     found, gradient = evaluated(factors, variables, robust)
     return found, gradient, factors, variables
 
@@ -114,8 +114,15 @@ def test_variables_give_back_the_motions():
     twists[:12, :3] = np.pi * np.repeat(np.vstack([np.eye(3), -np.eye(3)]), 2, axis=0)   # half turns
     motions = pose.exp(twists)
     back = np.tile(np.eye(4), (40, 1, 1))
-    pose_graph.motions_of(pose_graph.variables_of(motions, points), points, np.arange(40), back)
+    variables = pose_graph.variables_of(motions, np.arange(40), points)
+    pose_graph.motions_of(variables, points, np.arange(40), back)
     assert_allclose(back, motions, atol=1e-11)
+
+
+def test_edges_are_between_places_and_sorted():
+    edges = np.array([[0, 5], [1, 2], [0, 3], [4, 6], [1, 7], [2, 7]], np.int32)
+    place = np.array([2, 0, 1, 4, -1, 3, -1, 2], np.int32)
+    assert pose_graph.edges_between(edges, place, 5).tolist() == [[0, 1], [0, 2], [1, 2], [2, 3], [2, 4]]
 
 
 # --- agreement with gtsam ---

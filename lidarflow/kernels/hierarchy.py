@@ -47,12 +47,12 @@ def build(edges: np.ndarray, bounds: np.ndarray, stiffness: float) -> Hierarchy:
 def _flat(levels, all_bounds, stiffness) -> Hierarchy:
     """One list of nodes of all levels."""
     up_start, up, down_start, down, down_edge, parent, edge_parent = zip(*levels, strict=True)
-    node = np.cumsum([0] + [len(part) for part in parent])
-    edge = np.cumsum([0] + [len(part) for part in up])
+    node = np.cumsum([0] + [len(part) for part in parent]).tolist()
+    edge = np.cumsum([0] + [len(part) for part in up]).tolist()
 
     def shifted(parts, firsts):
         return np.concatenate([
-            np.where(part >= 0, part + first, -1) for part, first in zip(parts, firsts, strict=True)])
+            part + (part >= 0) * part.dtype.type(first) for part, first in zip(parts, firsts, strict=True)])
 
     def starts(parts):
         return np.append(shifted([part[:-1] for part in parts], edge[:-1]), edge[-1])

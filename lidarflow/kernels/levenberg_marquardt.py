@@ -5,7 +5,7 @@ from collections import namedtuple
 import numba
 import numpy as np
 
-from lidarflow.kernels import multigrid, pose_graph, twist_errors
+from lidarflow.kernels import multigrid, pose_graph, queue, twist_errors
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.hierarchy import weigh
 
@@ -31,19 +31,21 @@ def state_at(variables: np.ndarray) -> State:
 
 
 @njit(parallel=True)
-def optimise_each(factors, hierarchy, room, edge_bounds, shares, share_bounds, limits, state):
+def optimise_each(factors, hierarchy, room, edge_bounds, order, waiting, threads, limits, state):
     """Move the variables to the minimum: without, then with the truncated kernels.
 
-    Thread t does the components shares[share_bounds[t]:share_bounds[t + 1]], by themselves. Returns figures
-    (C, 2, FIGURES) of both steps.
+    Each of so many threads takes the next component of `order` (C,) from the queue `waiting` when it has done
+    one; who does which changes nothing. Returns figures (C, 2, FIGURES) of both steps.
     """
     figures = np.zeros((hierarchy.bounds.shape[1] - 1, 2, FIGURES))
-    for t in numba.prange(len(share_bounds) - 1):
+    for _ in numba.prange(threads):
         block = twist_errors.room()
-        for k in range(share_bounds[t], share_bounds[t + 1]):
-            c = shares[k]
+        task = queue.take(waiting)
+        while task < len(order):
+            c = order[task]
             edges = (edge_bounds[c], edge_bounds[c + 1])
             _optimise(factors, hierarchy, room, c, edges, limits, state, block, figures[c])
+            task = queue.take(waiting)
     return figures
 
 

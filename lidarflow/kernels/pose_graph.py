@@ -23,15 +23,17 @@ Factors = namedtuple("Factors", (
 
 
 @njit(parallel=True)
-def variables_of(motions, points):
-    """Variables (M, 7) of motions (M, 4, 4) at points (M, 3)."""
-    variables = np.empty((len(points), 7))
+def variables_of(motions, rows, points):
+    """Variables (M, 7) of the motions in `rows` (M,) of (N, 4, 4), at points (M, 3); zeros for row -1."""
+    variables = np.zeros((len(points), 7))
     for i in numba.prange(len(points)):
-        x, y, z, w = from_matrix(motions[i])
-        variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3] = x, y, z, w
-        for k in range(3):
-            variables[i, 4 + k] = (motions[i, k, 0] * points[i, 0] + motions[i, k, 1] * points[i, 1]
-                                   + motions[i, k, 2] * points[i, 2] + motions[i, k, 3])
+        if rows[i] >= 0:
+            motion = motions[rows[i]]
+            x, y, z, w = from_matrix(motion)
+            variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3] = x, y, z, w
+            for k in range(3):
+                variables[i, 4 + k] = (motion[k, 0] * points[i, 0] + motion[k, 1] * points[i, 1]
+                                       + motion[k, 2] * points[i, 2] + motion[k, 3])
     return variables
 
 
@@ -44,6 +46,28 @@ def motions_of(variables, points, rows, motions):
         for k in range(3):
             motion[k, 3] = variables[i, 4 + k] - (
                 motion[k, 0] * points[i, 0] + motion[k, 1] * points[i, 1] + motion[k, 2] * points[i, 2])
+
+
+@njit()
+def edges_between(edges, place, count):
+    """The edges (E, 2) between what has a place (M,), not -1, as sorted pairs of `count` places."""
+    first = np.zeros(count + 1, np.int64)
+    for e in range(len(edges)):
+        if place[edges[e, 0]] >= 0:
+            first[place[edges[e, 0]] + 1] += 1
+    first = np.cumsum(first)
+    end, found = first[:-1].copy(), np.empty((first[-1], 2), place.dtype)
+    for e in range(len(edges)):
+        i, j = place[edges[e, 0]], place[edges[e, 1]]
+        if i < 0:
+            continue
+        slot = end[i]
+        while slot > first[i] and found[slot - 1, 1] > j:
+            found[slot, 0], found[slot, 1] = i, found[slot - 1, 1]
+            slot -= 1
+        found[slot, 0], found[slot, 1] = i, j
+        end[i] += 1
+    return found
 
 
 @njit(error_model="numpy")
