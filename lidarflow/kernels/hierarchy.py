@@ -1,9 +1,9 @@
 """A hierarchy of ever coarser meshes, whose vertices are aggregates of points that move as one.
 
 Rigid motions of an aggregate cost no smoothness, and twists are all about the origin, so a coarse twist is
-that of all its points as it is, and the coarse equations are sums of the fine ones (Galerkin). Only edges
-count less on the next level: aggregates bend between each other only, as if each of their edges gave way
-as little as one of the fine ones does (Braess 1995). What holds a node where it is counts in full.
+that of all its points as it is, and the coarse equations are sums of the fine ones (Galerkin). But a coarse
+mesh gives way only where aggregates meet, and is too stiff (Braess 1995): its edges count less. What holds a
+node where it is counts in full, so that rigid motions are right on every level.
 
 All levels are in one list of nodes, level after level, and within each level component after component.
 """
