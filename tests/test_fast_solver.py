@@ -18,7 +18,7 @@ from lidarflow import config as settings
 from lidarflow import pipeline, pose
 from lidarflow.config import SolverConfig
 from lidarflow.datasets import open_dataset
-from lidarflow.kernels import pose_graph
+from lidarflow.kernels import pose_graph, twist_errors
 from lidarflow.solve import fast, gtsam_lm
 from lidarflow.types import ScanPair
 
@@ -48,19 +48,18 @@ def linearised(problem, config: SolverConfig, robust: bool):
     count = len(problem.points)
     edges = problem.edges[np.lexsort(problem.edges.T[::-1])]
     factors = fast.factors_of(problem, np.arange(count), np.arange(count), problem.points, edges, config)
-    variables = pose_graph.variables_of(problem.initial, problem.points)
-    found, gradient = evaluated(factors, variables, variables[:, 4:].copy(), robust)
+    variables = pose_graph.variables_of(problem.initial, np.arange(count), problem.points)
+    found, gradient = evaluated(factors, variables, robust)
     return found, gradient, factors, variables
 
 
-def evaluated(factors, variables, places, robust: bool):
+def evaluated(factors, variables, robust: bool):
     """Energy and gradient (M, 6) of variables (M, 7)."""
     count = len(variables)
     gradient, active = np.empty((count, 6)), np.empty(count, np.uint8)
-    nodes, edges = (0, count), (0, len(factors.edges))
-    smooth = pose_graph.smoothness(factors, variables, places, nodes, edges, gradient)
-    return smooth + pose_graph.evidence(
-        factors, variables, places, nodes, robust, gradient, active), gradient
+    nodes, edges, block = (0, count), (0, len(factors.edges)), twist_errors.room()
+    smooth = pose_graph.smoothness(factors, variables, nodes, edges, block, gradient)
+    return smooth + pose_graph.evidence(factors, variables, nodes, robust, block, gradient, active), gradient
 
 
 # --- energy and derivatives ---
@@ -85,7 +84,6 @@ def test_the_energy_is_that_of_gtsams_graph(config, robust, shift_m, turn_deg):
 @pytest.mark.parametrize(("shift_m", "turn_deg"), [(0.02, 0.5), (0.2, 40.0)])
 def test_the_gradient_is_the_numerical_one(config, robust, shift_m, turn_deg):
     _, gradient, factors, variables = linearised(tied_world(2, shift_m, turn_deg).problem, config, robust)
-    places = variables[:, 4:].copy()
     count = len(variables)
     for seed in range(8):
         twists = rng(seed).normal(size=(count, 6)) * [1.0, 1.0, 1.0, 0.3, 0.3, 0.3]
@@ -94,19 +92,19 @@ def test_the_gradient_is_the_numerical_one(config, robust, shift_m, turn_deg):
         ends = []
         for size in (1e-6, -1e-6):
             moved = np.empty_like(variables)
-            pose_graph.step(variables, places, (0, count), size * twists, moved)
-            ends.append(evaluated(factors, moved, places, robust)[0])
+            pose_graph.step(variables, (0, count), size * twists, moved)
+            ends.append(evaluated(factors, moved, robust)[0])
         assert_allclose((gradient * twists).sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-4, atol=1e-4)
 
 
-def test_wrenches_follow_their_places():
-    """The gradient for places elsewhere, moved to where the points are, is the one for places there."""
-    _, gradient, factors, variables = linearised(tied_world(3).problem, POINT, False)
-    places = variables[:, 4:] + rng(4).normal(size=(len(variables), 3))
-    _, elsewhere = evaluated(factors, variables, places, False)
-    assert np.abs(elsewhere - gradient).max() > 0.1
-    pose_graph.displace(places, variables, (0, len(variables)), elsewhere)
-    assert_allclose(elsewhere, gradient, atol=1e-9)
+@both_frames
+def test_a_twist_that_all_share_costs_no_smoothness(config):
+    problem = tied_world(3, 0.3, 40.0).problem
+    _, gradient, _, _ = linearised(
+        replace(problem, group=np.empty(0, np.int32), match_index=problem.match_index[:0],
+                match_target=problem.match_target[:0]), config, False)
+    assert np.abs(gradient).max() > 1.0
+    assert_allclose(gradient.sum(axis=0), 0.0, atol=1e-9)
 
 
 def test_variables_give_back_the_motions():
@@ -116,8 +114,15 @@ def test_variables_give_back_the_motions():
     twists[:12, :3] = np.pi * np.repeat(np.vstack([np.eye(3), -np.eye(3)]), 2, axis=0)   # half turns
     motions = pose.exp(twists)
     back = np.tile(np.eye(4), (40, 1, 1))
-    pose_graph.motions_of(pose_graph.variables_of(motions, points), points, np.arange(40), back)
+    variables = pose_graph.variables_of(motions, np.arange(40), points)
+    pose_graph.motions_of(variables, points, np.arange(40), back)
     assert_allclose(back, motions, atol=1e-11)
+
+
+def test_edges_are_between_places_and_sorted():
+    edges = np.array([[0, 5], [1, 2], [0, 3], [4, 6], [1, 7], [2, 7]], np.int32)
+    place = np.array([2, 0, 1, 4, -1, 3, -1, 2], np.int32)
+    assert pose_graph.edges_between(edges, place, 5).tolist() == [[0, 1], [0, 2], [1, 2], [2, 3], [2, 4]]
 
 
 # --- agreement with gtsam ---

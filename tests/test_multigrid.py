@@ -79,7 +79,8 @@ def meshes(*shapes):
 
 
 def prepared(at_sensor: bool, *shapes):
-    """A hierarchy with random evidence, ready to solve, and its dense normal equations of the points."""
+    """A hierarchy with random evidence, ready to solve, and the dense normal equations of the points' edges
+    and of what holds the points."""
     points, edges, bounds = meshes(*shapes)
     levels = hierarchy.build(edges, bounds, STIFFNESS)
     levels.lever[:] = 0.1 * points if at_sensor else points
@@ -88,15 +89,15 @@ def prepared(at_sensor: bool, *shapes):
     for c in range(len(shapes)):
         hierarchy.weigh(levels, c)
         multigrid.hold(levels, room, c, points, active, DATA, TIE, DAMPING)
-    matrix = np.zeros((len(points), 6, len(points), 6))
+    joined, held = np.zeros((2, len(points), 6, len(points), 6))
     for i, j in edges:
         block = at(levels.lever[j], STIFFNESS, STIFFNESS)
         for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
-            matrix[a, :, b] += sign * block
+            joined[a, :, b] += sign * block
     for i, point in enumerate(points):
         tie = TIE * (active[i] >> 1) + DAMPING
-        matrix[i, :, i] += at(point, DATA * (active[i] & 1) + tie, tie)
-    return levels, room, matrix.reshape(6 * len(points), -1)
+        held[i, :, i] += at(point, DATA * (active[i] & 1) + tie, tie)
+    return levels, room, joined.reshape(6 * len(points), -1), held.reshape(6 * len(points), -1)
 
 
 def test_the_hierarchy_joins_neighbours_until_no_edge_is_left():
@@ -119,15 +120,15 @@ def test_the_hierarchy_joins_neighbours_until_no_edge_is_left():
 
 @pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
 def test_coarse_equations_are_sums_of_the_fine_ones(at_sensor):
-    levels, room, matrix = prepared(at_sensor, (9, 7), (4, 3))
+    levels, room, joined, held = prepared(at_sensor, (9, 7), (4, 3))
     first, second, third = (np.arange(row[0], row[-1]) for row in levels.bounds[:3])
     for fine, coarse in ((first, second), (second, third)):
         members = np.zeros((len(fine), len(coarse)))
         kept = levels.parent[fine] >= 0
         members[np.flatnonzero(kept), levels.parent[fine][kept] - coarse[0]] = 1.0
         spread = np.kron(members, np.eye(6))
-        matrix = spread.T @ matrix @ spread
-        blocks = matrix.reshape(len(coarse), 6, len(coarse), 6)
+        joined, held = 0.5 * spread.T @ joined @ spread, spread.T @ held @ spread   # edges are softened
+        blocks = (joined + held).reshape(len(coarse), 6, len(coarse), 6)
         expected = np.zeros_like(blocks)
         edges_of_points = len(levels.up) - len(levels.inertias)
         for i in coarse:
@@ -141,26 +142,28 @@ def test_coarse_equations_are_sums_of_the_fine_ones(at_sensor):
 
 @pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
 def test_the_cycle_is_a_symmetric_preconditioner(at_sensor):
-    levels, room, matrix = prepared(at_sensor, (12, 7))
+    levels, room, joined, held = prepared(at_sensor, (12, 7))
+    matrix = joined + held
     count = len(matrix) // 6
     columns = []
     for k in range(6 * count):
         room.loads[:count] = np.eye(6 * count)[k].reshape(-1, 6)
-        multigrid.cycle(levels, room, 0, 1.0)
+        multigrid.cycle(levels, room, 0)
         columns.append(room.twists[:count].ravel().copy())
     inverse = np.stack(columns, axis=1)
     assert_allclose(inverse, inverse.T, atol=1e-9 * np.abs(inverse).max())
     shares = np.linalg.eigvals(inverse @ matrix).real
-    assert shares.min() > 0.03 and shares.max() < 1.0 + 1e-9
+    assert shares.min() > 0.03 and shares.max() < 1.9    # a step by 2 would gain nothing
 
 
 @pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
 def test_steps_solve_the_normal_equations(at_sensor):
-    levels, room, matrix = prepared(at_sensor, (16, 9), (3, 3), (1, 1))
+    levels, room, joined, held = prepared(at_sensor, (16, 9), (3, 3), (1, 1))
+    matrix = joined + held
     count = len(matrix) // 6
     gradient = rng(6).normal(size=(count, 6))
     for c in range(3):
-        assert multigrid.solve(levels, room, c, gradient, 1e-24, 0.0, 200, 1.8) < 60
+        assert multigrid.solve(levels, room, c, gradient, 1e-24, 0.0, 200) < 60
     expected = -np.linalg.solve(matrix, gradient.ravel()).reshape(-1, 6)
     assert_allclose(room.step, expected, atol=1e-7 * np.abs(expected).max())
-    assert multigrid.solve(levels, room, 0, gradient, 1e-24, 1e9, 200, 1.8) == 0   # not enough to gain
+    assert multigrid.solve(levels, room, 0, gradient, 1e-24, 1e9, 200) == -1   # not enough to gain

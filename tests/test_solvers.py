@@ -34,7 +34,7 @@ class Solver:
 
 
 # The fast one solves its normal equations by iteration, and stops by the energy, which is squared.
-@pytest.fixture(params=[("gtsam", 1e-9, 1e-9), ("fast", 1e-5, 3e-3)], ids=["gtsam", "fast"])
+@pytest.fixture(params=[("gtsam", 1e-9, 1e-9), ("fast", 3e-5, 3e-3)], ids=["gtsam", "fast"])
 def solve(request):
     return Solver(*request.param)
 

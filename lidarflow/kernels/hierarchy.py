@@ -1,7 +1,9 @@
 """A hierarchy of ever coarser meshes, whose vertices are aggregates of points that move as one.
 
 Rigid motions of an aggregate cost no smoothness, and twists are all about the origin, so a coarse twist is
-that of all its points as it is, and the coarse equations are sums of the fine ones (Galerkin).
+that of all its points as it is, and the coarse equations are sums of the fine ones (Galerkin). But a coarse
+mesh gives way only where aggregates meet, and is too stiff (Braess 1995): its edges count less. What holds a
+node where it is counts in full, so that rigid motions are right on every level.
 
 All levels are in one list of nodes, level after level, and within each level component after component.
 """
@@ -12,6 +14,8 @@ import numpy as np
 
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.inertia import SIZE, add_at
+
+_SOFTENING = 0.5    # share of the sum of edges that counts for the coarser one
 
 # bounds (L, C + 1): first node of every component on every level; the level after a component's last one
 # has no nodes of it. Neighbours of node i with higher numbers are up[up_start[i]:up_start[i + 1]], the edges
@@ -43,12 +47,12 @@ def build(edges: np.ndarray, bounds: np.ndarray, stiffness: float) -> Hierarchy:
 def _flat(levels, all_bounds, stiffness) -> Hierarchy:
     """One list of nodes of all levels."""
     up_start, up, down_start, down, down_edge, parent, edge_parent = zip(*levels, strict=True)
-    node = np.cumsum([0] + [len(part) for part in parent])
-    edge = np.cumsum([0] + [len(part) for part in up])
+    node = np.cumsum([0] + [len(part) for part in parent]).tolist()
+    edge = np.cumsum([0] + [len(part) for part in up]).tolist()
 
     def shifted(parts, firsts):
         return np.concatenate([
-            np.where(part >= 0, part + first, -1) for part, first in zip(parts, firsts, strict=True)])
+            part + (part >= 0) * part.dtype.type(first) for part, first in zip(parts, firsts, strict=True)])
 
     def starts(parts):
         return np.append(shifted([part[:-1] for part in parts], edge[:-1]), edge[-1])
@@ -67,6 +71,7 @@ def weigh(hierarchy, c):
     bounds, up_start, up = hierarchy.bounds, hierarchy.up_start, hierarchy.up
     inertias, incident, edge_parent = hierarchy.inertias, hierarchy.incident, hierarchy.edge_parent
     lever, stiffness, points_edges = hierarchy.lever, hierarchy.stiffness, len(up) - len(inertias)
+    softened = _SOFTENING * stiffness
     for level in range(len(bounds)):
         first, last = bounds[level, c], bounds[level, c + 1]
         incident[first:last] = 0.0
@@ -77,7 +82,7 @@ def weigh(hierarchy, c):
             add_at(incident, i, lever, up[e], stiffness, stiffness)
             add_at(incident, up[e], lever, up[e], stiffness, stiffness)
             if edge_parent[e] >= 0:
-                add_at(inertias, edge_parent[e] - points_edges, lever, up[e], stiffness, stiffness)
+                add_at(inertias, edge_parent[e] - points_edges, lever, up[e], softened, softened)
     for level in range(1, len(bounds)):
         for i in range(bounds[level, c], bounds[level, c + 1]):
             for e in range(up_start[i], up_start[i + 1]):
@@ -86,7 +91,7 @@ def weigh(hierarchy, c):
                     incident[i, k] += share
                     incident[up[e], k] += share
                     if edge_parent[e] >= 0:
-                        inertias[edge_parent[e] - points_edges, k] += share
+                        inertias[edge_parent[e] - points_edges, k] += _SOFTENING * share
 
 
 @njit()

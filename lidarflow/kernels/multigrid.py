@@ -13,6 +13,8 @@ from lidarflow.kernels import inertia
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.rotations import cross
 
+_NOTHING = 1e-300    # less is not worth a step, whatever is asked for
+
 # held (N, 10): inertia that holds each node where it is (matches, ties, damping); inverse (N, 10) of the sum
 # of that and of its edges; loads (N, 6) and twists (N, 6) of a cycle; seen (M, 6) of twists; then vectors of
 # the conjugate gradients, all (M, 6).
@@ -127,14 +129,14 @@ def _points_down(hierarchy, room, first, last):
 
 
 @njit(error_model="numpy")
-def _points_up(hierarchy, room, first, last, correction):
+def _points_up(hierarchy, room, first, last):
     """Add the coarser level's twists to those of points, then a Gauss-Seidel sweep in reversed order."""
     up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
     lever, parent, s = hierarchy.lever, hierarchy.parent, hierarchy.stiffness
     inverse, loads, twists, seen = room.inverse, room.loads, room.twists, room.seen
     for i in range(first, last):
         for k in range(6):
-            twists[i, k] += correction * twists[parent[i], k]
+            twists[i, k] += twists[parent[i], k]
     for i in range(last - 1, first - 1, -1):
         a, b, c, d, e, f = _sum(down, down_start[i], down_start[i + 1], twists)
         a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
@@ -180,7 +182,7 @@ def _nodes_down(hierarchy, room, first, last):
 
 
 @njit(error_model="numpy")
-def _nodes_up(hierarchy, room, first, last, correction):
+def _nodes_up(hierarchy, room, first, last):
     """As `_points_up`, for the nodes of a coarser level."""
     up_start, up, up_edge = hierarchy.up_start, hierarchy.up, hierarchy.up_edge
     down_start, down, down_edge = hierarchy.down_start, hierarchy.down, hierarchy.down_edge
@@ -189,7 +191,7 @@ def _nodes_up(hierarchy, room, first, last, correction):
     inverse, loads, twists = room.inverse, room.loads, room.twists
     for i in range(first, last):
         for k in range(6):
-            twists[i, k] += correction * twists[parent[i], k]
+            twists[i, k] += twists[parent[i], k]
     for i in range(last - 1, first - 1, -1):
         a, b, c, d, e, f = _pull(
             inertias, twists, down_edge, first_edge, down, down_start[i], down_start[i + 1])
@@ -200,7 +202,7 @@ def _nodes_up(hierarchy, room, first, last, correction):
 
 
 @njit(error_model="numpy")
-def cycle(hierarchy, room, c, correction):
+def cycle(hierarchy, room, c):
     """One V-cycle: about the `twists` that the `loads` of the first level make of component c."""
     bounds = hierarchy.bounds
     levels = levels_of(hierarchy, c)
@@ -212,9 +214,9 @@ def cycle(hierarchy, room, c, correction):
         else:
             _nodes_down(hierarchy, room, bounds[level, c], bounds[level, c + 1])
     for level in range(levels - 2, 0, -1):
-        _nodes_up(hierarchy, room, bounds[level, c], bounds[level, c + 1], correction)
+        _nodes_up(hierarchy, room, bounds[level, c], bounds[level, c + 1])
     if levels > 1:
-        _points_up(hierarchy, room, bounds[0, c], bounds[0, c + 1], correction)
+        _points_up(hierarchy, room, bounds[0, c], bounds[0, c + 1])
 
 
 @njit(error_model="numpy")
@@ -265,12 +267,20 @@ def _dot(a, b, first, last):
 
 
 @njit(error_model="numpy")
-def solve(hierarchy, room, c, gradient, tolerance, enough, most, correction):
+def _add_all(rows, scale, others, first, last):
+    for i in range(first, last):
+        for k in range(6):
+            rows[i, k] += scale * others[i, k]
+
+
+@njit(error_model="numpy")
+def solve(hierarchy, room, c, gradient, tolerance, enough, most):
     """Fill `step` (M, 6) of component c with the twists that minimise the quadratic model of the energy.
 
-    Conjugate gradients, until an iteration gains less than `tolerance` of what all have gained, or `most`
-    iterations. Where less than `enough` seems to be there to gain, none is made. Returns how many were made,
-    each with one product and one cycle, whose coarse twists are lengthened by `correction`.
+    Conjugate gradients, until a cycle foresees less than `tolerance` of what all iterations have gained, or
+    `most` iterations. That last cycle's twists are part of the step as they are. Where less than `enough`
+    seems to be there to gain from the start, no step is made. Returns how many iterations were made, each
+    with a cycle and a product, or -1 for no step.
     """
     first, last = hierarchy.bounds[0, c], hierarchy.bounds[0, c + 1]
     loads, step, direction, product = room.loads, room.step, room.direction, room.product
@@ -280,18 +290,17 @@ def solve(hierarchy, room, c, gradient, tolerance, enough, most, correction):
             step[i, k] = 0.0
     gain, last_square = 0.0, 1.0
     for iteration in range(most):
-        cycle(hierarchy, room, c, correction)
+        cycle(hierarchy, room, c)
         square = _dot(loads, room.twists, first, last)
-        if not square > 0.0 or (iteration == 0 and 0.5 * square < enough):
+        if iteration == 0 and not 0.5 * square >= max(enough, _NOTHING):
+            return -1
+        if 0.5 * square <= tolerance * gain:
+            _add_all(step, 1.0, room.twists, first, last)
             return iteration
         _turn_direction(hierarchy, room, first, last, square / last_square if iteration else 0.0)
         length = square / _multiply(hierarchy, room, first, last)
-        for i in range(first, last):
-            for k in range(6):
-                step[i, k] += length * direction[i, k]
-                loads[i, k] -= length * product[i, k]
+        _add_all(step, length, direction, first, last)
+        _add_all(loads, -length, product, first, last)
         last_square = square
         gain += 0.5 * length * square
-        if 0.5 * length * square <= tolerance * gain:
-            return iteration + 1
     return most

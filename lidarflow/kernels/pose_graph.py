@@ -1,9 +1,8 @@
 """The pointwise factor graph: its exact energy and gradient, and steps of its variables.
 
 A variable is a row x, y, z, w of the rotation's quaternion, then the moved point. A step of it is a twist
-(6,), rotation first, about the origin of the target's frame: the twist turns the rotation, and shifts the
-point by what it does at the point's `place`. Places are where the points were when last linearised. A
-gradient is a wrench (6,): torque about the origin, then force.
+(6,), rotation first, about the origin of the target's frame: it turns the rotation, and shifts the point by
+what it does there. A gradient is a wrench (6,): torque about the origin, then force.
 """
 
 from collections import namedtuple
@@ -11,17 +10,9 @@ from collections import namedtuple
 import numba
 import numpy as np
 
+from lidarflow.kernels import twist_errors
 from lidarflow.kernels.compiled import njit
-from lidarflow.kernels.rotations import (
-    between,
-    cross,
-    from_matrix,
-    inverse_jacobian,
-    logarithm,
-    stepped,
-    to_matrix,
-    turned,
-)
+from lidarflow.kernels.rotations import cross, from_matrix, stepped, to_matrix, turned
 
 # points (M, 3); edges (E, 2) i < j, sorted by component; matched (M,) bool, targets (M, 3); tied (M,) bool,
 # ties (M, 7) rows as of variables; at_point: eq. 10 seen at the point. Then the weights, and the squares
@@ -32,15 +23,17 @@ Factors = namedtuple("Factors", (
 
 
 @njit(parallel=True)
-def variables_of(motions, points):
-    """Variables (M, 7) of motions (M, 4, 4) at points (M, 3)."""
-    variables = np.empty((len(points), 7))
+def variables_of(motions, rows, points):
+    """Variables (M, 7) of the motions in `rows` (M,) of (N, 4, 4), at points (M, 3); zeros for row -1."""
+    variables = np.zeros((len(points), 7))
     for i in numba.prange(len(points)):
-        x, y, z, w = from_matrix(motions[i])
-        variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3] = x, y, z, w
-        for k in range(3):
-            variables[i, 4 + k] = (motions[i, k, 0] * points[i, 0] + motions[i, k, 1] * points[i, 1]
-                                   + motions[i, k, 2] * points[i, 2] + motions[i, k, 3])
+        if rows[i] >= 0:
+            motion = motions[rows[i]]
+            x, y, z, w = from_matrix(motion)
+            variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3] = x, y, z, w
+            for k in range(3):
+                variables[i, 4 + k] = (motion[k, 0] * points[i, 0] + motion[k, 1] * points[i, 1]
+                                       + motion[k, 2] * points[i, 2] + motion[k, 3])
     return variables
 
 
@@ -55,122 +48,120 @@ def motions_of(variables, points, rows, motions):
                 motion[k, 0] * points[i, 0] + motion[k, 1] * points[i, 1] + motion[k, 2] * points[i, 2])
 
 
-@njit(error_model="numpy")
-def _twist_error(first, i, second, j, dx, dy, dz, px, py, pz):
-    """Squared norm of the twist from the pose i to the pose j, less an offset d in i's axes, seen from −p.
-
-    Then the gradient of half of it: force at i, torque at i, in the axes that i leads to. Those at j are in
-    balance with them.
-    """
-    ax, ay, az, aw = first[i, 0], first[i, 1], first[i, 2], first[i, 3]
-    qx, qy, qz, qw = between(ax, ay, az, aw, second[j, 0], second[j, 1], second[j, 2], second[j, 3])
-    ox, oy, oz, c, slope = logarithm(qx, qy, qz, qw)
-    sx, sy, sz = turned(
-        -ax, -ay, -az, aw, second[j, 4] - first[i, 4], second[j, 5] - first[i, 5], second[j, 6] - first[i, 6])
-    tx, ty, tz = sx - dx, sy - dy, sz - dz
-    yx, yy, yz = inverse_jacobian(ox, oy, oz, c, 1.0, tx, ty, tz)
-    lx, ly, lz = cross(px, py, pz, ox, oy, oz)
-    yx, yy, yz = yx + lx, yy + ly, yz + lz
-    square = ox * ox + oy * oy + oz * oz + yx * yx + yy * yy + yz * yz
-
-    # By ω, through J⁻¹(ω) t as well, then by t.
-    ot = ox * tx + oy * ty + oz * tz
-    yo = yx * ox + yy * oy + yz * oz
-    yt = yx * tx + yy * ty + yz * tz
-    along = 1.0 - 2.0 * c * yt + 2.0 * slope * (yo * ot - yt * (ox * ox + oy * oy + oz * oz))
-    mx, my, mz = cross(yx, yy, yz, px + 0.5 * tx, py + 0.5 * ty, pz + 0.5 * tz)
-    gx = along * ox + mx + c * (yx * ot + tx * yo)
-    gy = along * oy + my + c * (yy * ot + ty * yo)
-    gz = along * oz + mz + c * (yz * ot + tz * yo)
-    fx, fy, fz = inverse_jacobian(ox, oy, oz, c, -1.0, yx, yy, yz)
-    gx, gy, gz = inverse_jacobian(ox, oy, oz, c, -1.0, gx, gy, gz)
-    mx, my, mz = cross(fx, fy, fz, sx, sy, sz)
-    fx, fy, fz = turned(ax, ay, az, aw, -fx, -fy, -fz)
-    mx, my, mz = turned(ax, ay, az, aw, mx - gx, my - gy, mz - gz)
-    return square, fx, fy, fz, mx, my, mz
+@njit()
+def edges_between(edges, place, count):
+    """The edges (E, 2) between what has a place (M,), not -1, as sorted pairs of `count` places."""
+    first = np.zeros(count + 1, np.int64)
+    for e in range(len(edges)):
+        if place[edges[e, 0]] >= 0:
+            first[place[edges[e, 0]] + 1] += 1
+    first = np.cumsum(first)
+    end, found = first[:-1].copy(), np.empty((first[-1], 2), place.dtype)
+    for e in range(len(edges)):
+        i, j = place[edges[e, 0]], place[edges[e, 1]]
+        if i < 0:
+            continue
+        slot = end[i]
+        while slot > first[i] and found[slot - 1, 1] > j:
+            found[slot, 0], found[slot, 1] = i, found[slot - 1, 1]
+            slot -= 1
+        found[slot, 0], found[slot, 1] = i, j
+        end[i] += 1
+    return found
 
 
 @njit(error_model="numpy")
-def _add(wrenches, i, places, weight, fx, fy, fz, tx, ty, tz):
-    """Add a force and a torque at a variable's place, times a weight, to its wrench about the origin."""
-    mx, my, mz = cross(places[i, 0], places[i, 1], places[i, 2], fx, fy, fz)
-    wrenches[i, 0] += weight * (tx + mx)
-    wrenches[i, 1] += weight * (ty + my)
-    wrenches[i, 2] += weight * (tz + mz)
-    wrenches[i, 3] += weight * fx
-    wrenches[i, 4] += weight * fy
-    wrenches[i, 5] += weight * fz
-
-
-@njit(error_model="numpy")
-def _add_balance(wrenches, j, places, weight, first, i, second, fx, fy, fz, tx, ty, tz):
-    """Add at pose j what is in balance with a force and a torque at pose i."""
-    mx, my, mz = cross(
-        first[i, 4] - second[j, 4], first[i, 5] - second[j, 5], first[i, 6] - second[j, 6], fx, fy, fz)
-    _add(wrenches, j, places, -weight, fx, fy, fz, tx + mx, ty + my, tz + mz)
-
-
-@njit(error_model="numpy")
-def smoothness(factors, variables, places, nodes, edges, wrenches):
+def smoothness(factors, variables, nodes, edges, block, wrenches):
     """Energy of the edges from edges[0] to edges[1] (eq. 10), which are all those of the variables
     from nodes[0] to nodes[1], whose gradient is written to `wrenches` (M, 6)."""
-    points, pairs, weight, at_point = (
-        factors.points, factors.edges, factors.smoothness_weight, factors.at_point)
+    pairs, weight = factors.edges, factors.smoothness_weight
     wrenches[nodes[0]:nodes[1]] = 0.0
     total = 0.0
-    px = py = pz = 0.0
-    for e in range(edges[0], edges[1]):
-        i, j = pairs[e, 0], pairs[e, 1]
-        x, y, z = points[j, 0], points[j, 1], points[j, 2]
-        if not at_point:
-            px, py, pz = x, y, z
-        square, fx, fy, fz, tx, ty, tz = _twist_error(
-            variables, i, variables, j, x - points[i, 0], y - points[i, 1], z - points[i, 2], px, py, pz)
-        total += square
-        _add(wrenches, i, places, weight, fx, fy, fz, tx, ty, tz)
-        _add_balance(wrenches, j, places, weight, variables, i, variables, fx, fy, fz, tx, ty, tz)
+    for start in range(edges[0], edges[1], twist_errors.WIDTH):
+        count = min(twist_errors.WIDTH, edges[1] - start)
+        for k in range(count):
+            i, j = pairs[start + k, 0], pairs[start + k, 1]
+            twist_errors.put_poses(block, k, variables, i, variables, j)
+            twist_errors.put_points(block, k, factors.points, i, j, factors.at_point)
+        twist_errors.evaluate(block)
+        for k in range(count):
+            total += twist_errors.square(block, k)
+            twist_errors.add_wrench(block, k, weight, wrenches, pairs[start + k, 0])
+            twist_errors.add_wrench(block, k, -weight, wrenches, pairs[start + k, 1])
     return 0.5 * weight * total
 
 
 @njit(error_model="numpy")
-def evidence(factors, variables, places, nodes, robust, wrenches, active):
+def evidence(factors, variables, nodes, robust, block, wrenches, active):
     """Energy of the matches and ties of the variables from nodes[0] to nodes[1]; adds its gradient.
 
     Fills `active` (M,): 1 for a match that counts, 2 for a tie. With `robust` those beyond the truncation
     do not.
     """
-    matched, targets, tied, ties = factors.matched, factors.targets, factors.tied, factors.ties
-    total = 0.0
-    for i in range(nodes[0], nodes[1]):
-        active[i] = 0
-        if matched[i]:
-            rx, ry, rz = (variables[i, 4] - targets[i, 0], variables[i, 5] - targets[i, 1],
-                          variables[i, 6] - targets[i, 2])
-            square = rx * rx + ry * ry + rz * rz
-            if robust and square > factors.truncation_sq:
-                square = factors.truncation_sq
-            else:
-                active[i] += 1
-                _add(wrenches, i, places, factors.data_weight, rx, ry, rz, 0.0, 0.0, 0.0)
-            total += factors.data_weight * square
-        if tied[i]:
-            square, fx, fy, fz, tx, ty, tz = _twist_error(ties, i, variables, i, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-            if robust and square > factors.tie_truncation_sq:
-                square = factors.tie_truncation_sq
-            else:
-                active[i] += 2
-                _add_balance(
-                    wrenches, i, places, factors.tie_weight, ties, i, variables, fx, fy, fz, tx, ty, tz)
-            total += factors.tie_weight * square
-    return 0.5 * total
+    active[nodes[0]:nodes[1]] = 0
+    return (_matches(factors, variables, nodes, robust, wrenches, active)
+            + _ties(factors, variables, nodes, robust, block, wrenches, active))
 
 
 @njit(error_model="numpy")
-def step(variables, places, nodes, twists, moved):
+def _matches(factors, variables, nodes, robust, wrenches, active):
+    matched, targets, weight, most = (
+        factors.matched, factors.targets, factors.data_weight, factors.truncation_sq)
+    total = 0.0
+    for i in range(nodes[0], nodes[1]):
+        if not matched[i]:
+            continue
+        x, y, z = variables[i, 4], variables[i, 5], variables[i, 6]
+        fx, fy, fz = x - targets[i, 0], y - targets[i, 1], z - targets[i, 2]
+        square = fx * fx + fy * fy + fz * fz
+        if robust and square > most:
+            total += most
+            continue
+        total += square
+        active[i] += 1
+        tx, ty, tz = cross(x, y, z, fx, fy, fz)
+        wrenches[i, 0] += weight * tx
+        wrenches[i, 1] += weight * ty
+        wrenches[i, 2] += weight * tz
+        wrenches[i, 3] += weight * fx
+        wrenches[i, 4] += weight * fy
+        wrenches[i, 5] += weight * fz
+    return 0.5 * weight * total
+
+
+@njit(error_model="numpy")
+def _ties(factors, variables, nodes, robust, block, wrenches, active):
+    tied, ties, weight, most = factors.tied, factors.ties, factors.tie_weight, factors.tie_truncation_sq
+    total = 0.0
+    twist_errors.put_together(block)
+    for start in range(nodes[0], nodes[1], twist_errors.WIDTH):
+        count = min(twist_errors.WIDTH, nodes[1] - start)
+        some = False
+        for k in range(count):
+            twist_errors.put_poses(block, k, ties, start + k, variables, start + k)
+            some = some or tied[start + k]
+        if not some:
+            continue
+        twist_errors.evaluate(block)
+        for k in range(count):
+            if not tied[start + k]:
+                continue
+            square = twist_errors.square(block, k)
+            if robust and square > most:
+                total += most
+                continue
+            total += square
+            active[start + k] += 2
+            twist_errors.add_wrench(block, k, -weight, wrenches, start + k)
+    return 0.5 * weight * total
+
+
+@njit(error_model="numpy")
+def step(variables, nodes, twists, moved):
     """Write the variables nodes[0] .. nodes[1], each moved by its twist of `twists` (M, 6), to `moved`."""
     for i in range(nodes[0], nodes[1]):
         ox, oy, oz = twists[i, 0], twists[i, 1], twists[i, 2]
-        ux, uy, uz = cross(ox, oy, oz, places[i, 0], places[i, 1], places[i, 2])
+        ux, uy, uz = cross(ox, oy, oz, variables[i, 4], variables[i, 5], variables[i, 6])
         moved[i, 0], moved[i, 1], moved[i, 2], moved[i, 3] = stepped(
             variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3], ox, oy, oz)
         moved[i, 4] = variables[i, 4] + ux + twists[i, 3]
@@ -179,11 +170,10 @@ def step(variables, places, nodes, twists, moved):
 
 
 @njit(error_model="numpy")
-def place(factors, variables, nodes, places, levers):
-    """Put the places of variables where their points are.
+def place_levers(factors, variables, nodes, levers):
+    """Put `levers` (M, 3) where the twist between a variable and an earlier neighbour is seen.
 
-    `levers` (M, 3) are where the twist between neighbours is seen: at the point, or at what the sensor's
-    origin becomes when it moves with the point.
+    That is at the point, or at what the sensor's origin becomes when it moves with the point.
     """
     points, at_point = factors.points, factors.at_point
     for i in range(nodes[0], nodes[1]):
@@ -191,18 +181,5 @@ def place(factors, variables, nodes, places, levers):
         if not at_point:
             x, y, z = turned(variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3],
                              points[i, 0], points[i, 1], points[i, 2])
-        places[i, 0], places[i, 1], places[i, 2] = variables[i, 4], variables[i, 5], variables[i, 6]
         levers[i, 0], levers[i, 1], levers[i, 2] = (
             variables[i, 4] - x, variables[i, 5] - y, variables[i, 6] - z)
-
-
-@njit(error_model="numpy")
-def displace(places, variables, nodes, wrenches):
-    """Make wrenches about the origin of forces at `places` those of the same forces where the points are."""
-    for i in range(nodes[0], nodes[1]):
-        mx, my, mz = cross(
-            variables[i, 4] - places[i, 0], variables[i, 5] - places[i, 1], variables[i, 6] - places[i, 2],
-            wrenches[i, 3], wrenches[i, 4], wrenches[i, 5])
-        wrenches[i, 0] += mx
-        wrenches[i, 1] += my
-        wrenches[i, 2] += mz

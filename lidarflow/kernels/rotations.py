@@ -4,7 +4,7 @@ import math
 
 from lidarflow.kernels.compiled import njit
 
-_SERIES_BELOW = 0.01    # squared sine of half an angle, below which the series are exact to rounding
+SERIES_BELOW = 0.01    # squared sine of half an angle, below which the series are exact to rounding
 
 
 @njit(error_model="numpy")
@@ -40,21 +40,28 @@ def logarithm(x, y, z, w):
     J⁻¹(ω) = I − ½ [ω] + c [ω]², c = (1 − ½|ω| cot ½|ω|) / |ω|².
     """
     sine_sq = x * x + y * y + z * z
-    if sine_sq < _SERIES_BELOW:
-        s = sine_sq
-        scale = 2.0 + s * (1.0 / 3.0 + s * (3.0 / 20.0 + s * (
-            5.0 / 56.0 + s * (35.0 / 576.0 + s * 63.0 / 1408.0))))
-        a = scale * scale * s
-        c = 1.0 / 12.0 + a * (1.0 / 720.0 + a * (1.0 / 30240.0 + a * (1.0 / 1209600.0 + a / 47900160.0)))
-        slope = 1.0 / 720.0 + a * (1.0 / 15120.0 + a * (1.0 / 403200.0 + a / 11975040.0))
-    else:
-        sine = math.sqrt(sine_sq)
-        half = math.atan2(sine, w)
-        scale = 2.0 * half / sine
-        angle_sq = 4.0 * half * half
-        cot = w / sine
-        c = (1.0 - half * cot) / angle_sq
-        slope = (-0.25 * (cot / half - 1.0 / sine_sq) - 2.0 * c) / (2.0 * angle_sq)
+    if sine_sq < SERIES_BELOW:
+        return logarithm_series(x, y, z)
+    sine = math.sqrt(sine_sq)
+    half = math.atan2(sine, w)
+    scale = 2.0 * half / sine
+    angle_sq = 4.0 * half * half
+    cot = w / sine
+    c = (1.0 - half * cot) / angle_sq
+    slope = (-0.25 * (cot / half - 1.0 / sine_sq) - 2.0 * c) / (2.0 * angle_sq)
+    return scale * x, scale * y, scale * z, c, slope
+
+
+@njit(error_model="numpy")
+def logarithm_series(x, y, z):
+    """`logarithm` of a quaternion whose squared sine x² + y² + z² is below SERIES_BELOW."""
+    s = x * x + y * y + z * z
+    scale = 2.0 + s * (1.0 / 3.0 + s * (3.0 / 20.0 + s * (
+        5.0 / 56.0 + s * (35.0 / 576.0 + s * (63.0 / 1408.0)))))
+    a = scale * scale * s
+    c = 1.0 / 12.0 + a * (1.0 / 720.0 + a * (1.0 / 30240.0 + a * (
+        1.0 / 1209600.0 + a * (1.0 / 47900160.0))))
+    slope = 1.0 / 720.0 + a * (1.0 / 15120.0 + a * (1.0 / 403200.0 + a * (1.0 / 11975040.0)))
     return scale * x, scale * y, scale * z, c, slope
 
 

@@ -11,13 +11,12 @@ import numba
 import numpy as np
 
 from lidarflow.config import SolverConfig
-from lidarflow.kernels import hierarchy, levenberg_marquardt, multigrid, pose_graph
+from lidarflow.kernels import hierarchy, levenberg_marquardt, multigrid, pose_graph, queue
 from lidarflow.solve import common
 from lidarflow.types import FlowProblem, SolveStats
 
-_STEP_TOLERANCE = 0.03    # conjugate gradients stop at an iteration that adds less than this to their gain
+_STEP_TOLERANCE = 0.03    # conjugate gradients stop where less than this is left to add to their gain
 _MAX_PRODUCTS = 50
-_CORRECTION = 1.8         # aggregates are too stiff: coarse steps are lengthened (Braess 1995)
 
 
 def solve(
@@ -50,25 +49,23 @@ def _optimise(
     counts = np.bincount(label[rows], minlength=tried.sum())
     bounds = np.concatenate([[0], np.cumsum(counts)])
 
-    edges = place[problem.edges]
-    edges = edges[edges[:, 0] >= 0]
-    edges = edges[np.argsort(edges[:, 0].astype(np.int64) * len(rows) + edges[:, 1])]
+    edges = pose_graph.edges_between(problem.edges, place, len(rows))
     edge_bounds = np.searchsorted(edges[:, 0], bounds)
     points = problem.points[rows]
     factors = factors_of(problem, rows, place, points, edges, config)
     levels = hierarchy.build(edges, bounds, config.smoothness_weight)
-    variables = pose_graph.variables_of(problem.initial[rows], points)
+    variables = pose_graph.variables_of(problem.initial, rows, points)
     # Twists are about the origin of the target's frame: each component gets one of its own, near to it.
     origin = np.repeat(variables[bounds[:-1], 4:], counts, axis=0)
     for positions in (variables[:, 4:], factors.targets, factors.ties[:, 4:]):
         positions -= origin
-    shares, share_bounds = _shares(counts)
+    largest_first = np.argsort(-counts, kind="stable")
     limits = levenberg_marquardt.Limits(
         config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE, _STEP_TOLERANCE,
-        _MAX_PRODUCTS, _CORRECTION)
+        _MAX_PRODUCTS)
     figures = levenberg_marquardt.optimise_each(
-        factors, levels, multigrid.room_for(levels), edge_bounds, shares, share_bounds, limits,
-        levenberg_marquardt.state_at(variables))
+        factors, levels, multigrid.room_for(levels), edge_bounds, largest_first, queue.tasks(),
+        numba.get_num_threads(), limits, levenberg_marquardt.state_at(variables))
     variables[:, 4:] += origin
     pose_graph.motions_of(variables, points, rows, motions)
     return figures
@@ -86,23 +83,10 @@ def factors_of(
     index = place[problem.match_index]
     matched[index[index >= 0]] = True
     targets[index[index >= 0]] = problem.match_target[index >= 0]
-    tied, ties = np.zeros(len(rows), bool), np.zeros((len(rows), 7))
-    if len(problem.group):
-        group = problem.group[rows]
-        tied = group >= 0
-        ties[tied] = pose_graph.variables_of(problem.group_motions[group[tied]], points[tied])
+    group = problem.group[rows] if len(problem.group) else np.full(len(rows), -1, np.int32)
+    ties = pose_graph.variables_of(problem.group_motions, group, points)
     return pose_graph.Factors(
-        points, edges, matched, targets, tied, ties, config.smoothness_frame == "point", config.data_weight,
-        config.smoothness_weight, config.tie_weight, config.truncation_m**2, config.tie_truncation**2)
+        points, edges, matched, targets, group >= 0, ties, config.smoothness_frame == "point",
+        config.data_weight, config.smoothness_weight, config.tie_weight, config.truncation_m**2,
+        config.tie_truncation**2)
 
-
-def _shares(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Components for every thread, the largest first to whoever has least; who does which changes nothing."""
-    threads = numba.get_num_threads()
-    loads, shares = [0] * threads, [[] for _ in range(threads)]
-    for c in np.argsort(-counts, kind="stable").tolist():
-        thread = loads.index(min(loads))
-        loads[thread] += int(counts[c])
-        shares[thread].append(c)
-    return (np.concatenate([np.array(share, np.int64) for share in shares]),
-            np.cumsum([0] + [len(share) for share in shares]))
