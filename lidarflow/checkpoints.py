@@ -11,7 +11,6 @@ import json
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -89,9 +88,7 @@ def packed(pair: ScanPair, result: FlowResult, tracks: Tracks) -> bytes:
     for name, shape in _OF_OBJECTS.items():
         arrays[f"object_{name}"] = np.array(
             [getattr(found, name) for found in result.objects], float).reshape(-1, *shape)
-    content = BytesIO()
-    np.savez_compressed(content, **arrays)
-    return content.getvalue()
+    return io.archive(arrays)
 
 
 def unpacked(file: Path, pair: ScanPair) -> tuple[FlowResult, Tracks]:
@@ -174,9 +171,7 @@ def renumbered(file: Path, numbers: Numbers) -> bytes:
     arrays["track_ids"] = np.array([numbers.of(old) for old in arrays["track_ids"].tolist()], np.int64)
     notes = json.loads(str(arrays["notes"]))
     arrays["notes"] = np.array(json.dumps({**notes, "next_id": numbers.next_id}))
-    content = BytesIO()
-    np.savez_compressed(content, **arrays)
-    return content.getvalue()
+    return io.archive(arrays)
 
 
 def _distinct(motions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import shutil
 import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,16 @@ def written_aside(path: Path) -> Iterator[Path]:
         raise DataError(f"cannot write {path}: {reason}; free space or choose another --out") from error
 
 
+def archive(arrays: dict[str, np.ndarray]) -> bytes:
+    """The bytes of an .npz file, compressed.
+
+    NumPy, writing to a full disk, may name an open handle as the reason; bytes fail as any file does.
+    """
+    content = BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()
+
+
 def save_flow(path: Path, points: np.ndarray, result: FlowResult, config: Config) -> None:
     """Write a flow file (.npz) of the source scan's `points` (N, 3), metres, and its `result`.
 
@@ -128,8 +138,8 @@ def save_flow(path: Path, points: np.ndarray, result: FlowResult, config: Config
         "config": np.array(as_json(to_dict(config))),
         "stats": np.array(as_json(asdict(result.stats))),
     }
-    with written_aside(path) as aside, aside.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+    with written_aside(path) as aside:
+        aside.write_bytes(archive(arrays))
 
 
 def load_flow(path: Path) -> FlowFile:

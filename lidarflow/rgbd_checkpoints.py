@@ -1,10 +1,10 @@
 """What a run keeps of every finished RGB-D pair until it is complete; as checkpoints.py for LiDAR pairs."""
 
 import json
-from io import BytesIO
 
 import numpy as np
 
+from lidarflow import io
 from lidarflow.checkpoints import CheckpointFiles, digest_of, naming_damage, read_bound
 from lidarflow.rgbd_types import Camera, RgbdPair, RgbdResult
 
@@ -21,9 +21,7 @@ class RgbdCheckpoints(CheckpointFiles):
         arrays = {name: getattr(result, name) for name in _PLAIN} | {
             "digest": np.array(_digest(pair)), "notes": np.array(json.dumps({"seconds": result.seconds})),
             "camera": np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy])}
-        content = BytesIO()
-        np.savez_compressed(content, **arrays)
-        self.put(index, content.getvalue())
+        self.put(index, io.archive(arrays))
 
     def load(self, index: int, pair: RgbdPair) -> tuple[RgbdResult, None]:
         """The answer of the pair at `index`; DataError where it is damaged, or was made of other images."""

@@ -53,8 +53,8 @@ def save_flow(path: Path, source: RgbdFrame, result: RgbdResult, config: RgbdCon
         "camera": np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]),
         "config": np.array(io.as_json(settings.to_dict(config))), "stats": np.array(io.as_json(stats)),
     }
-    with io.written_aside(path) as aside, aside.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+    with io.written_aside(path) as aside:
+        aside.write_bytes(io.archive(arrays))
 
 
 def load_flow(path: Path) -> RgbdFlowFile:

@@ -22,6 +22,7 @@ import rerun.blueprint as rrb
 from lidarflow import colour, pose
 from lidarflow.errors import DataError, InstallError
 from lidarflow.rgbd_types import RgbdPair
+from lidarflow.silence import silenced
 from lidarflow.types import FlowResult, ScanPair
 
 FRAME, TIME = "frame", "time"
@@ -76,9 +77,14 @@ def open_stream(path: Path | None, application_id: str, spawn: bool,
 def close(stream: rr.RecordingStream, path: Path | None = None) -> None:
     """Write what is still buffered and end the recording; OSError where the file `path` lacks its end.
 
-    Rerun writes in threads of its own, which only log that a disk is full.
+    Rerun writes in threads of its own, which only log that a disk is full, or end.
     """
-    stream.flush()
+    try:
+        stream.flush()
+    except RuntimeError as error:
+        with silenced(2):   # it would log the same
+            stream.disconnect()
+        raise OSError(errno.EIO, f"the recording cannot be written, is the disk full? ({error})") from None
     stream.disconnect()
     if path is not None and not _ends_well(Path(path)):
         raise OSError(errno.EIO, "the end of the recording is missing, is the disk full?")

@@ -1,14 +1,12 @@
 """Ground points by Patchwork++ (Lee, Lim, Myung 2022), for sensors at any height."""
 
-import contextlib
-import os
-import sys
 from dataclasses import dataclass
 
 import numpy as np
 
 from lidarflow.config import GroundConfig
 from lidarflow.kernels import ground_level
+from lidarflow.silence import silenced
 
 _PATCHWORK_HEIGHT_M = 1.723   # the height Patchwork++ is tuned for; clouds are shifted to it
 _CELL_M = 2.0
@@ -107,21 +105,7 @@ def _patchwork(points: np.ndarray) -> np.ndarray:
     parameters.enable_RNR = False   # noise removal by intensity: clouds here need not have any
     parameters.sensor_height = _PATCHWORK_HEIGHT_M
     parameters.min_range = _PATCHWORK_MIN_RANGE_M
-    with _silent_stdout():
+    with silenced(1):   # it greets, whatever `verbose` says
         estimator = pypatchworkpp.patchworkpp(parameters)
-        estimator.estimateGround(np.column_stack([points, np.zeros(len(points), np.float32)]))
+    estimator.estimateGround(np.column_stack([points, np.zeros(len(points), np.float32)]))
     return np.asarray(estimator.getGroundIndices(), np.int64)
-
-
-@contextlib.contextmanager
-def _silent_stdout():
-    """Send the process's standard output to nowhere: the extension greets on it whatever `verbose` says."""
-    sys.stdout.flush()
-    saved, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 1)
-        yield
-    finally:
-        os.dup2(saved, 1)
-        os.close(saved)
-        os.close(nowhere)
