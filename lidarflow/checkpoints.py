@@ -157,8 +157,8 @@ def numbers_of(file: Path) -> np.ndarray:
     return io.read_archive(file, ("object_id",))["object_id"]
 
 
-def renumbered(file: Path, numbers: Numbers) -> bytes:
-    """A checkpoint as `packed` makes it, with other numbers of objects; tracks without one are let go."""
+def renumbered(file: Path, numbers: Numbers) -> dict[str, np.ndarray]:
+    """What is in a checkpoint, with other numbers of objects; tracks without one are let go."""
     arrays = io.read_archive(file, _NAMES)
     arrays["object_ids"] = np.array([numbers.of(old) for old in arrays["object_ids"].tolist()], np.int64)
     old, row = np.unique(arrays["object_id"], return_inverse=True)
@@ -171,7 +171,7 @@ def renumbered(file: Path, numbers: Numbers) -> bytes:
     arrays["track_ids"] = np.array([numbers.of(old) for old in arrays["track_ids"].tolist()], np.int64)
     notes = json.loads(str(arrays["notes"]))
     arrays["notes"] = np.array(json.dumps({**notes, "next_id": numbers.next_id}))
-    return io.archive(arrays)
+    return arrays
 
 
 def _distinct(motions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

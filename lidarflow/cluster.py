@@ -12,6 +12,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -132,12 +133,17 @@ def join(chunks: list[Chunk], kept: Checkpoints) -> None:
     for chunk in chunks:
         folder = _folder(kept, chunk)
         numbers = Numbers(_same_objects(folder, chunk, last), next_id)
-        files = {index: folder / f"{index:06d}.npz" for index in range(chunk.start, chunk.stop)}
-        last = {}
-        for index, file in files.items():
-            if file.is_file():     # a scan that was left out has none
-                kept.put(index, renumbered(file, numbers))
-                last[index] = numbers_of(kept.file(index))
+        last, packing = {}, {}
+        # Numbers are given in order. Packing anew is what takes time, and needs no order.
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            for index in range(chunk.start, chunk.stop):
+                file = folder / f"{index:06d}.npz"
+                if file.is_file():     # a scan that was left out has none
+                    arrays = renumbered(file, numbers)
+                    packing[index] = threads.submit(io.archive, arrays)
+                    last[index] = arrays["object_id"]
+            for index, content in packing.items():
+                kept.put(index, content.result())
         next_id = numbers.next_id
 
 

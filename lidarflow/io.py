@@ -108,12 +108,15 @@ def written_aside(path: Path) -> Iterator[Path]:
 
 
 def archive(arrays: dict[str, np.ndarray]) -> bytes:
-    """The bytes of an .npz file, compressed.
+    """The bytes of an .npz file, compressed as fast as it goes: NumPy's own takes twice as long for 1 % less.
 
-    NumPy, writing to a full disk, may name an open handle as the reason; bytes fail as any file does.
+    In memory: on a full disk NumPy may name an open handle as the reason; bytes fail as any file does.
     """
     content = BytesIO()
-    np.savez_compressed(content, **arrays)
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as packed:
+        for name, array in arrays.items():
+            with packed.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
     return content.getvalue()
 
 

@@ -1,6 +1,6 @@
 """Milliseconds a pair, beside what others take on the same scans, as tables and JSON.
 
-    python scripts/benchmark.py FOLDER… [--pairs 20] [--threads 2] [--growth] [--json FILE]
+    python scripts/benchmark.py FOLDER… [--pairs 20] [--threads 2] [--growth] [--start] [--json FILE]
 
 Every scan is in memory before the clock starts, every method has run once, and all take turns pair by pair,
 so that what else the machine does falls on all. Figures are medians over at least --pairs pairs; short
@@ -13,14 +13,17 @@ Open3D ICP           point to plane, 0.2 m voxels, the same start value
 Open3D FPFH+RANSAC   features and RANSAC at 0.5 m, then that ICP from what RANSAC finds (--pairs 3 at most)
 
 --growth merges scans into clouds of 15,000 to 500,000 points and fits the exponent of each stage; such clouds
-have no rings, so that the mesh is the one of tangent planes. Accuracy is measured by scripts/evaluate.py, the
-solvers are compared on equal problems by scripts/compare_solvers.py.
+have no rings, so that the mesh is the one of tangent planes. --start times a program of its own from its
+begin to the flow of its first pair, less what its second takes: imports, and kernels from the cache. Accuracy
+is measured by scripts/evaluate.py, the solvers are compared on equal problems by scripts/compare_solvers.py.
 """
 
 import argparse
 import json
 import os
 import resource
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -181,6 +184,30 @@ def growth(scans: list[Scan], repeat: int) -> dict[int, dict[str, float]]:
     return found
 
 
+FIRST_PAIR = """
+import sys, time
+begin = time.perf_counter()
+from lidarflow import estimate_flow
+from lidarflow.datasets import open_dataset
+dataset = open_dataset(sys.argv[1])
+pair = dataset.scan(0), dataset.scan(1)
+estimate_flow(pair)
+first = time.perf_counter()
+estimate_flow(pair)
+print((first - begin) - (time.perf_counter() - first))
+"""
+
+
+def start_s(folder: Path, repeat: int) -> float:
+    """Median seconds that a program needs before it can compute, once kernels are compiled."""
+    taken = []
+    for _ in range(repeat + 1):
+        done = subprocess.run([sys.executable, "-c", FIRST_PAIR, str(folder)], capture_output=True, text=True,
+                              check=True)
+        taken.append(float(done.stdout))
+    return float(np.median(taken[1:]))
+
+
 def exponents(by_size: dict[int, dict[str, float]]) -> dict[str, float]:
     """The exponent of N that fits each stage best, from 60,000 points on: below, fixed costs rule."""
     sizes = [size for size in by_size if size >= 60_000]
@@ -196,6 +223,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=20)
     parser.add_argument("--threads", type=int, default=numba.get_num_threads())
     parser.add_argument("--growth", action="store_true")
+    parser.add_argument("--start", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     numba.set_num_threads(options.threads)
@@ -225,6 +253,9 @@ def main() -> None:
                 for name in by_size[SIZES[0]]]
         print(table(["our stage [ms]", *(f"{size:,}" for size in by_size), "exponent"], rows), "\n")
         told |= {"growth_ms": by_size, "exponents": fitted}
+    if options.start:
+        told["start_s"] = start_s(options.folders[0], 5)
+        print(f"start {told['start_s']:.2f} s\n")
     told["peak_memory_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"peak memory {told['peak_memory_gb']:.2f} GB, of all methods together")
     if options.json:

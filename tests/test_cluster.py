@@ -195,7 +195,8 @@ def test_objects_keep_their_numbers_across_chunks(street, tmp_path):
             (folder / f"{index:06d}.npz").write_bytes(content)
             if chunk.start:
                 numbers = Numbers(dict(other), 99)
-                (folder / f"{index:06d}.npz").write_bytes(renumbered(folder / f"{index:06d}.npz", numbers))
+                file = folder / f"{index:06d}.npz"
+                file.write_bytes(io.archive(renumbered(file, numbers)))
     for index in range(4):
         kept.file(index).unlink()
     cluster.join(chunks, kept)

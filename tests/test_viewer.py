@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -198,3 +199,19 @@ def test_paths_that_cannot_be_used_are_data_errors(tmp_path):
         viewer.open_in_viewer(tmp_path / "absent.rrd")
     with pytest.raises(ValueError, match="path"):
         viewer.open_recording(None)
+
+
+class Ended:
+    """A stream whose writer has ended, as when the disk is full; it says so once more when it is let go."""
+
+    def flush(self):
+        raise RuntimeError("writer ended")
+
+    def disconnect(self):
+        os.write(2, b"writer ended\n")
+
+
+def test_a_recording_that_cannot_be_ended_is_one_error(capfd):
+    with pytest.raises(OSError, match="is the disk full"):
+        viewer.close(Ended())
+    assert capfd.readouterr().err == ""
