@@ -37,6 +37,8 @@ _SAME_SHARE = 0.5      # of an object's points, for it to be the same in two chu
 # would take fright at another number of threads than it has.
 _THREADS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
             "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+# Dask has its workers give memory back at once; arrays as large as ours would be mapped anew every time.
+_TRIMMED = "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_"
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +188,7 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator:
             yield client
         return
     local = {"host": _HERE, "dashboard_address": f"{_HERE}:0", "worker_dashboard_address": f"{_HERE}:0"}
-    with (dask.config.set({"distributed.nanny.environ": _THREADS}),
+    with (dask.config.set({"distributed.nanny.environ": _THREADS, _TRIMMED: None}),
           distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True,
                                    silence_logs=logging.CRITICAL, **local) as cluster,
           distributed.Client(cluster, set_as_default=False) as client):
