@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,8 +56,8 @@ def damaged(street, tmp_path):
 @pytest.mark.parametrize("place, number, how", [
     ("os.replace", 1, "before"),                                # before the settings are there
     ("os.replace", 2, "after"),                                 # after what the run is made of
-    ("numpy.savez_compressed", 2, "before"),          # first flow file there, no checkpoint
-    ("numpy.savez_compressed", 3, "after"),           # second flow file written aside
+    ("lidarflow.io.archive", 2, "before"),                      # first flow file there, no checkpoint
+    ("lidarflow.io.archive", 3, "after"),                       # second flow file about to be written
     ("lidarflow.checkpoints.packed", 3, "before"),              # flow file in place, checkpoint not
     ("os.replace", 8, "before"),
     ("lidarflow.io.write_objects", 1, "before"),                # all pairs done, nothing put together
@@ -302,7 +303,7 @@ def test_files_that_may_not_grow_are_one_line(street, tmp_path, monkeypatch, lid
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(io.np, "savez_compressed", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     said = lidarflow.complaint("run", street, "--out", tmp_path / "run", "--method", "zero", "--no-record")
     assert "No space left" in said and not list(tmp_path.rglob("*.part"))
 

@@ -70,8 +70,8 @@ def walk(data, method="ours"):
 
 @pytest.mark.parametrize("place, number, how", [
     ("os.replace", 1, "before"),                      # before the settings are there
-    ("numpy.savez_compressed", 2, "before"),          # first flow file there, no checkpoint
-    ("numpy.savez_compressed", 5, "after"),           # third flow file written aside
+    ("lidarflow.io.archive", 2, "before"),            # first flow file there, no checkpoint
+    ("lidarflow.io.archive", 5, "after"),             # third flow file about to be written
     ("os.replace", 6, "before"),                      # second checkpoint written aside
     ("lidarflow.io.write_poses_tum", 1, "before"),    # all pairs done, nothing put together
     ("lidarflow.io.write_json", 3, "after"),          # metrics there, no times
