@@ -123,6 +123,14 @@ def test_leading_shapes_broadcast():
     assert pose.identity(2, 3).shape == (2, 3, 4, 4) and pose.identity().shape == (4, 4)
 
 
+def test_no_motion_at_all_is_an_empty_answer():
+    none = np.zeros((0, 4, 4))
+    assert pose.exp(np.zeros((0, 6))).shape == (0, 4, 4)
+    assert pose.from_translation_quaternion(np.zeros((0, 7))).shape == (0, 4, 4)
+    assert pose.log(none).shape == (0, 6) and pose.to_translation_quaternion(none).shape == (0, 7)
+    assert pose.rotation_distance(none, none).shape == pose.translation_distance(none, none).shape == (0,)
+
+
 def test_distances_are_those_of_the_relative_motion():
     start = pose.exp(twists(10, 2.0, seed=15))
     step = pose.exp(np.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.0])) @ pose.from_translation([3.0, 0.0, 4.0])
