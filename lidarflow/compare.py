@@ -11,7 +11,7 @@ from lidarflow.config import Config, to_dict
 from lidarflow.datasets import Dataset
 from lidarflow.errors import ConfigError, LidarflowError
 from lidarflow.lidar import features
-from lidarflow.types import FlowResult, Scan, ScanPair, Truth
+from lidarflow.types import FlowResult, ScanPair, Truth
 
 
 @dataclass(slots=True)
@@ -86,7 +86,7 @@ def compare(
     found = Comparison(runs, [], [], config)
     for index, pair, results in _pairs(dataset, frames, runs, config):
         truth, origin = runner.find_truth(dataset, index, pair)
-        above_ground = _above_ground(pair.source, config)
+        above_ground = features.masks(pair.source, config).standing
         for run, result in zip(runs, results, strict=True):
             run.figures.append(figures_of(pair, result, truth, above_ground, config.crispness.sigma_m))
         found.frames.append(pair.source.name)
@@ -137,9 +137,3 @@ def figures_of(
     return figures | {
         "epe_static_m": scores.static.mean, "epe_dynamic_m": scores.dynamic.mean, "t_e_m": t_e,
         "r_e_rad": r_e, "movers_found": scores.movers_found, "false_movers": scores.false_movers}
-
-
-def _above_ground(scan: Scan, config: Config) -> np.ndarray:
-    """Mask (N,) of the usable points of a scan that are not ground."""
-    seen = features.masks(scan, config)
-    return seen.usable & ~seen.ground

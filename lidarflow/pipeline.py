@@ -208,8 +208,7 @@ def prepare(
 
 
 def _mesh(scan: Scan, seen: features.Features, config: Config) -> Mesh:
-    return mesh.build(
-        scan.points, seen.usable & ~seen.ground, seen.surface, config.mesh, config.normals.radius_m)
+    return mesh.build(scan.points, seen.standing, seen.surface, config.mesh, config.normals.radius_m)
 
 
 def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
@@ -273,7 +272,7 @@ def _refined(
     if len(motions) and prepared.target_mesh is not None:
         surface = refinement.Surface.around(
             pose.apply(motions, part.problem.points), pair.target.points,
-            np.flatnonzero(target.usable & ~target.ground), target.cloud.upright.tree, prepared.target_mesh)
+            np.flatnonzero(target.standing), target.cloud.upright.tree, prepared.target_mesh)
         motions = refinement.refined(
             part.problem, motions, surface,
             lambda problem, settings: solve(problem, settings, config.graph.min_matches),

@@ -31,7 +31,7 @@ def evaluate_pair(dataset, index: int, config: settings.Config) -> str:
     pair = ScanPair(dataset.scan(index), dataset.scan(index + 1))
     points = pair.source.points
     source, target = (features.extract(scan, config) for scan in (pair.source, pair.target))
-    kept = source.usable & ~source.ground
+    kept = source.standing
     found = mesh.build(points, kept, source.surface, config.mesh, config.normals.radius_m)
     # The gate is centred on the point itself: nothing is known of the motion beforehand.
     graph = frontend.build_problem(pair, source, target, found, pose.identity(len(points)), config).problem

@@ -55,5 +55,5 @@ def register(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def _standing(scan: Scan, masks: Masks) -> np.ndarray:
     """Points (N, 3) of a scan above ground; all of them where hardly any are."""
-    standing = masks.usable & ~masks.ground
+    standing = masks.standing
     return scan.points[standing if standing.sum() >= _MIN_STANDING else masks.usable]

@@ -9,7 +9,7 @@ import numpy as np
 from lidarflow import pose
 from lidarflow.config import Config
 from lidarflow.lidar import features, preparation
-from lidarflow.lidar.features import Features, Masks
+from lidarflow.lidar.features import Masks
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.stopwatch import Stopwatch
 from lidarflow.types import FlowResult, Scan, ScanPair, SolveStats
@@ -52,7 +52,7 @@ class WholeScan(ABC):
     def reset(self) -> None:
         """Begin anew with the next scan."""
         self._timed = Stopwatch()
-        self._previous: tuple[Scan, Masks | Features | None] | None = None
+        self._previous: tuple[Scan, Masks | None] | None = None
 
     @classmethod
     def estimate(cls, pair: ScanPair, config: Config | None = None) -> FlowResult:
@@ -81,17 +81,17 @@ class WholeScan(ABC):
         """Take the flow to this scan for known; what is needed of the scan is prepared when it is."""
         self._previous = scan, None
 
-    def _prepare(self, scan: Scan) -> Masks | Features:
+    def _prepare(self, scan: Scan) -> Masks:
         """What is needed of one scan."""
         with self._timed("ground"):
             return features.masks(scan, self.config)
 
     @abstractmethod
-    def _register(self, pair: ScanPair, source: Masks | Features, target: Masks | Features) -> Registered:
+    def _register(self, pair: ScanPair, source: Masks, target: Masks) -> Registered:
         """The motion of the source onto the target."""
 
     def _result(
-        self, scan: Scan, prepared: Masks | Features, found: Registered, seconds: dict[str, float]
+        self, scan: Scan, prepared: Masks, found: Registered, seconds: dict[str, float]
     ) -> FlowResult:
         """The motion spread over all points; it rests on evidence where the point took part."""
         n = len(scan)

@@ -24,7 +24,7 @@ def build(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray, np
 
 def first_per_voxel(points: np.ndarray, voxel_m: float) -> np.ndarray:
     """Indices (V,), ascending, of the point nearest to the centre of each occupied voxel; points (N, 3)."""
-    return np.sort(_first_per_voxel(np.ascontiguousarray(points), float(voxel_m)))
+    return first_of_each(np.ascontiguousarray(points), float(voxel_m))
 
 
 def voxels(points: np.ndarray, voxel_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +100,8 @@ def _hash(x, y, z):
 
 
 @njit()
-def _first_per_voxel(points, voxel_m):
+def first_of_each(points, voxel_m):
+    """As `first_per_voxel`, for other kernels."""
     number, counts = numbered(points, voxel_m)
     first, least_sq = np.empty(len(counts), np.int64), np.full(len(counts), np.inf)
     for i in range(len(points)):
@@ -110,7 +111,16 @@ def _first_per_voxel(points, voxel_m):
             off_sq += (place - math.floor(place) - 0.5) ** 2
         if off_sq < least_sq[number[i]]:
             least_sq[number[i]], first[number[i]] = off_sq, i
-    return first
+    return np.sort(first)
+
+
+@njit(inline="always")
+def room(starts, ends, run_count):
+    """How many points the runs hold."""
+    count = 0
+    for run in range(run_count):
+        count += ends[run] - starts[run]
+    return count
 
 
 @njit(inline="always")

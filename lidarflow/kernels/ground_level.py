@@ -124,7 +124,7 @@ def _reaches(tree, heights, lowest, highest, x, y, reach_sq, low, high):
         depth -= 1
         node = waiting[depth]
         adds = (not above and highest[node] >= low) or (not below and lowest[node] <= high)
-        if not adds or trees.box_distance_sq(tree, node, x, y, 0.0) >= reach_sq:
+        if not adds or trees.box_distance_sq(tree.boxes, node, x, y, 0.0) >= reach_sq:
             continue
         if node < leaves:
             waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2
@@ -143,21 +143,12 @@ def _reaches(tree, heights, lowest, highest, x, y, reach_sq, low, high):
 def _nearest(tree, x, y, reach_sq, near, near_sq):
     """Fill places and squared distances of the nearest, ascending; the places of missing ones are -1."""
     near[:], near_sq[:] = -1, reach_sq
-    leaves = len(tree.ends) // 2
-    waiting = np.empty(trees.DEPTH, np.int64)
-    waiting[0], depth = 0, 1
+    waiting, waiting_sq = np.empty(trees.DEPTH, np.int64), np.empty(trees.DEPTH)
+    waiting[0], waiting_sq[0], depth = 0, trees.box_distance_sq(tree.boxes, 0, x, y, 0.0), 1
     while depth > 0:
-        depth -= 1
-        node = waiting[depth]
-        if trees.box_distance_sq(tree, node, x, y, 0.0) >= near_sq[-1]:
+        node, node_sq, depth = trees.descend(tree, x, y, 0.0, near_sq[-1], waiting, waiting_sq, depth)
+        if node_sq >= near_sq[-1]:
             continue
-        while node < leaves:
-            left, right = 2 * node + 1, 2 * node + 2
-            if trees.box_distance_sq(tree, left, x, y, 0.0) > trees.box_distance_sq(tree, right, x, y, 0.0):
-                left, right = right, left
-            waiting[depth] = right
-            depth += 1
-            node = left
         for i in range(tree.starts[node], tree.ends[node]):
             apart_sq = trees.distance_sq(tree.points, i, x, y, 0.0)
             if apart_sq >= near_sq[-1] or math.isnan(apart_sq):

@@ -150,7 +150,7 @@ def _fit(rows, own, target, target_normals, ground, limits, fit, gates_m, motion
     """Bring `motion` (4, 4) to that of the rows onto the target's planes."""
     points = own.points[rows]
     if len(rows) > fit.voxel_points:
-        rows = rows[np.sort(grid._first_per_voxel(points, fit.voxel_m))]
+        rows = rows[grid.first_of_each(points, fit.voxel_m)]
         points = own.points[rows]
     centre = icp.mean(points)
     x, y, z = moved(centre, motion)

@@ -48,9 +48,7 @@ def _best_in_gate(
         i = by_place[visit]
         starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
         run_count = grid.runs(centres[i], keys, lower, shape, gate_m, starts, ends)
-        room = 0
-        for run in range(run_count):
-            room += ends[run] - starts[run]
+        room = grid.room(starts, ends, run_count)
         index, distance_sq = np.empty(room, np.int64), np.empty(room)
         count = 0
         for run in range(run_count):

@@ -57,7 +57,10 @@ def counts_around(
 
 def number_around(tree: Tree, points: np.ndarray, radius_m: float) -> np.ndarray:
     """How many (K,) of the tree's points lie within `radius_m` of each of points (K, 3)."""
-    return _number_around(tree, np.ascontiguousarray(points), float(radius_m))
+    counts = np.zeros((len(points), 1), np.int64)
+    each = np.arange(len(tree.rows) + 1)[:, None]   # every point counts, whatever it is
+    _counts_around(tree, each, np.ascontiguousarray(points), float(radius_m), counts)
+    return counts[:, 0]
 
 
 def any_within(tree: Tree, points: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
@@ -182,7 +185,7 @@ def _counts_around(tree, before, points, radius_m, counts):
         while depth > 0:
             depth -= 1
             node = waiting[depth]
-            if box_distance_sq(tree, node, x, y, z) > radius_sq:
+            if box_distance_sq(tree.boxes, node, x, y, z) > radius_sq:
                 continue
             start, end = tree.starts[node], tree.ends[node]
             if _farthest_sq(tree, node, points, k) <= radius_sq:
@@ -196,27 +199,3 @@ def _counts_around(tree, before, points, radius_m, counts):
                     if distance_sq(tree.points, i, x, y, z) <= radius_sq:
                         for mark in range(counts.shape[1]):
                             counts[k, mark] += before[i + 1, mark] - before[i, mark]
-
-
-@njit()
-def _number_around(tree, points, radius_m):
-    leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
-    waiting, numbers = np.empty(DEPTH, np.int64), np.zeros(len(points), np.int64)
-    for k in range(len(points)):
-        x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        waiting[0], depth = 0, 1
-        while depth > 0:
-            depth -= 1
-            node = waiting[depth]
-            if box_distance_sq(tree, node, x, y, z) > radius_sq:
-                continue
-            start, end = tree.starts[node], tree.ends[node]
-            if _farthest_sq(tree, node, points, k) <= radius_sq:
-                numbers[k] += end - start
-            elif node < leaves:
-                waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2
-                depth += 2
-            else:
-                for i in range(start, end):
-                    numbers[k] += distance_sq(tree.points, i, x, y, z) <= radius_sq
-    return numbers

@@ -42,9 +42,7 @@ def _estimate_some(points, surface, keys, lower, shape, radius_m, normals):
         if i == 0 or cell != last:
             last = cell
             run_count = grid.runs_around(cell, keys, shape, starts, ends)
-            room = 1
-            for run in range(run_count):
-                room += ends[run] - starts[run]
+            room = grid.room(starts, ends, run_count) + 1
             if room > len(offsets):
                 offsets = np.empty((2 * room, 3))
         count = _gather(points[i], surface, radius_m * radius_m, starts, ends, run_count, offsets)

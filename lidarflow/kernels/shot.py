@@ -56,9 +56,7 @@ def _describe_some(
     bins, shares = np.empty((_SHARES, 0), np.int64), np.empty((_SHARES, 0))
     for i in range(len(keypoints)):
         run_count = grid.runs(keypoints[i], keys, lower, shape, radius_m, starts, ends)
-        room = 1
-        for run in range(run_count):
-            room += ends[run] - starts[run]
+        room = grid.room(starts, ends, run_count) + 1
         if room > len(index):
             room *= 2
             offsets, index, cosines = np.empty((4, room)), np.empty(room, np.int64), np.empty(room)

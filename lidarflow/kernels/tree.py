@@ -138,11 +138,11 @@ def _median(a, b, c):
 
 
 @njit(inline="always")
-def box_distance_sq(tree, node, x, y, z):
-    """Squared distance of x, y, z from a node's box, 0 inside it."""
-    dx = max(max(tree.boxes[node, 0, 0] - x, x - tree.boxes[node, 1, 0]), 0.0)
-    dy = max(max(tree.boxes[node, 0, 1] - y, y - tree.boxes[node, 1, 1]), 0.0)
-    dz = max(max(tree.boxes[node, 0, 2] - z, z - tree.boxes[node, 1, 2]), 0.0)
+def box_distance_sq(boxes, i, x, y, z):
+    """Squared distance of x, y, z from box i, 0 inside it."""
+    dx = max(max(boxes[i, 0, 0] - x, x - boxes[i, 1, 0]), 0.0)
+    dy = max(max(boxes[i, 0, 1] - y, y - boxes[i, 1, 1]), 0.0)
+    dz = max(max(boxes[i, 0, 2] - z, z - boxes[i, 1, 2]), 0.0)
     return dx * dx + dy * dy + dz * dz
 
 
@@ -154,28 +154,38 @@ def distance_sq(points, i, x, y, z):
 
 
 @njit()
+def descend(tree, x, y, z, bound_sq, waiting, waiting_sq, depth):
+    """Take the last of the waiting nodes and go down from it to its nearest leaf.
+
+    The other children on the way wait, where they are nearer than the root of `bound_sq`. Returns the leaf,
+    its squared distance and how many wait now; a node that is no leaf is as far as the bound.
+    """
+    depth -= 1
+    node, node_sq = waiting[depth], waiting_sq[depth]
+    leaves = len(tree.ends) // 2
+    while node < leaves and node_sq < bound_sq:
+        left, right = 2 * node + 1, 2 * node + 2
+        left_sq, right_sq = (
+            box_distance_sq(tree.boxes, left, x, y, z), box_distance_sq(tree.boxes, right, x, y, z))
+        if left_sq > right_sq:
+            left, right, left_sq, right_sq = right, left, right_sq, left_sq
+        if right_sq < bound_sq:
+            waiting[depth], waiting_sq[depth] = right, right_sq
+            depth += 1
+        node, node_sq = left, left_sq
+    return node, node_sq, depth
+
+
+@njit()
 def nearest(tree, x, y, z, best_sq, best):
     """Place in the tree of the point nearest to x, y, z, and its squared distance.
 
     `best` and `best_sq` where nothing is nearer than the root of `best_sq`.
     """
-    leaves = len(tree.ends) // 2
     waiting, waiting_sq = np.empty(DEPTH, np.int64), np.empty(DEPTH)
-    waiting[0], waiting_sq[0], depth = 0, box_distance_sq(tree, 0, x, y, z), 1
+    waiting[0], waiting_sq[0], depth = 0, box_distance_sq(tree.boxes, 0, x, y, z), 1
     while depth > 0:
-        depth -= 1
-        node, node_sq = waiting[depth], waiting_sq[depth]
-        if node_sq >= best_sq:
-            continue
-        while node < leaves:
-            left, right = 2 * node + 1, 2 * node + 2
-            left_sq, right_sq = box_distance_sq(tree, left, x, y, z), box_distance_sq(tree, right, x, y, z)
-            if left_sq > right_sq:
-                left, right, left_sq, right_sq = right, left, right_sq, left_sq
-            if right_sq < best_sq:
-                waiting[depth], waiting_sq[depth] = right, right_sq
-                depth += 1
-            node, node_sq = left, left_sq
+        node, node_sq, depth = descend(tree, x, y, z, best_sq, waiting, waiting_sq, depth)
         if node_sq >= best_sq:
             continue
         for i in range(tree.starts[node], tree.ends[node]):
@@ -191,22 +201,11 @@ def nearest_two(tree, x, y, z, reach_sq):
 
     Distances are `reach_sq` where nothing is nearer.
     """
-    leaves = len(tree.ends) // 2
     best, best_sq, second_sq = -1, reach_sq, reach_sq
     waiting, waiting_sq = np.empty(DEPTH, np.int64), np.empty(DEPTH)
-    waiting[0], waiting_sq[0], depth = 0, box_distance_sq(tree, 0, x, y, z), 1
+    waiting[0], waiting_sq[0], depth = 0, box_distance_sq(tree.boxes, 0, x, y, z), 1
     while depth > 0:
-        depth -= 1
-        node, node_sq = waiting[depth], waiting_sq[depth]
-        while node < leaves and node_sq < second_sq:
-            left, right = 2 * node + 1, 2 * node + 2
-            left_sq, right_sq = box_distance_sq(tree, left, x, y, z), box_distance_sq(tree, right, x, y, z)
-            if left_sq > right_sq:
-                left, right, left_sq, right_sq = right, left, right_sq, left_sq
-            if right_sq < second_sq:
-                waiting[depth], waiting_sq[depth] = right, right_sq
-                depth += 1
-            node, node_sq = left, left_sq
+        node, node_sq, depth = descend(tree, x, y, z, second_sq, waiting, waiting_sq, depth)
         if node_sq >= second_sq:
             continue
         for i in range(tree.starts[node], tree.ends[node]):
@@ -227,11 +226,12 @@ def within(tree, x, y, z, radius_sq):
     while depth > 0:
         depth -= 1
         node = waiting[depth]
-        if box_distance_sq(tree, node, x, y, z) > radius_sq:
+        if box_distance_sq(tree.boxes, node, x, y, z) > radius_sq:
             continue
         while node < leaves:
             left, right = 2 * node + 1, 2 * node + 2
-            left_sq, right_sq = box_distance_sq(tree, left, x, y, z), box_distance_sq(tree, right, x, y, z)
+            left_sq, right_sq = (
+                box_distance_sq(tree.boxes, left, x, y, z), box_distance_sq(tree.boxes, right, x, y, z))
             if left_sq > right_sq:
                 left, right, left_sq, right_sq = right, left, right_sq, left_sq
             if right_sq <= radius_sq:
@@ -253,7 +253,7 @@ def all_within(tree, x, y, z, radius_sq, found):
     while depth > 0:
         depth -= 1
         node = waiting[depth]
-        if box_distance_sq(tree, node, x, y, z) > radius_sq:
+        if box_distance_sq(tree.boxes, node, x, y, z) > radius_sq:
             continue
         if node < leaves:
             waiting[depth], waiting[depth + 1] = 2 * node + 1, 2 * node + 2

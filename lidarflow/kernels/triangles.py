@@ -92,37 +92,18 @@ def _nearest_triangle(corners, boxes, tree, x, y, z, best_sq, guess):
         guess_sq = _apart_sq(corners, guess, x, y, z)
         if guess_sq < best_sq:
             best_sq, best = guess_sq, guess
-    leaves = len(tree.ends) // 2
     waiting, waiting_sq = np.empty(trees.DEPTH, np.int64), np.empty(trees.DEPTH)
-    waiting[0], waiting_sq[0], depth = 0, trees.box_distance_sq(tree, 0, x, y, z), 1
+    waiting[0], waiting_sq[0], depth = 0, trees.box_distance_sq(tree.boxes, 0, x, y, z), 1
     while depth > 0:
-        depth -= 1
-        node, node_sq = waiting[depth], waiting_sq[depth]
-        while node < leaves and node_sq < best_sq:
-            left, right = 2 * node + 1, 2 * node + 2
-            left_sq = trees.box_distance_sq(tree, left, x, y, z)
-            right_sq = trees.box_distance_sq(tree, right, x, y, z)
-            if left_sq > right_sq:
-                left, right, left_sq, right_sq = right, left, right_sq, left_sq
-            waiting[depth], waiting_sq[depth] = right, right_sq
-            depth += 1
-            node, node_sq = left, left_sq
+        node, node_sq, depth = trees.descend(tree, x, y, z, best_sq, waiting, waiting_sq, depth)
         if node_sq >= best_sq:
             continue
         for i in range(tree.starts[node], tree.ends[node]):
-            if _box_distance_sq(boxes, i, x, y, z) < best_sq:
+            if trees.box_distance_sq(boxes, i, x, y, z) < best_sq:
                 apart_sq = _apart_sq(corners, i, x, y, z)
                 if apart_sq < best_sq:
                     best, best_sq = i, apart_sq
     return best_sq, best
-
-
-@njit(inline="always")
-def _box_distance_sq(boxes, i, x, y, z):
-    dx = max(max(boxes[i, 0, 0] - x, x - boxes[i, 1, 0]), 0.0)
-    dy = max(max(boxes[i, 0, 1] - y, y - boxes[i, 1, 1]), 0.0)
-    dz = max(max(boxes[i, 0, 2] - z, z - boxes[i, 1, 2]), 0.0)
-    return dx * dx + dy * dy + dz * dz
 
 
 @njit(inline="always")

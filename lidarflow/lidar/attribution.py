@@ -81,7 +81,7 @@ def search(
     view = view_of_pair.look(moved, target.cloud, config.objects)
     expected = _expected(tracks, ego_motion)
     found = seeds.find(view, expected.points, config.objects)
-    rows = np.flatnonzero(source.usable & ~source.ground)
+    rows = np.flatnonzero(source.standing)
     return Search(len(source.usable), rows, view, expected, found)
 
 

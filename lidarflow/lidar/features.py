@@ -24,6 +24,11 @@ class Masks:
     usable: np.ndarray
     ground: np.ndarray
 
+    @property
+    def standing(self) -> np.ndarray:
+        """The usable points (N,) bool above ground."""
+        return self.usable & ~self.ground
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keypoints:
@@ -38,17 +43,13 @@ class Keypoints:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Features:
+class Features(Masks):
     """A prepared scan; what takes long may still be under way, and is waited for when it is asked for.
 
-    usable     (N,) bool   as in Masks
-    ground     (N,) bool
     cloud      Cloud       these points: what stands upright, rows ascending, and the ground
     keypoints  Keypoints
     """
 
-    usable: np.ndarray
-    ground: np.ndarray
     begun_cloud: "Future[Cloud]"
     begun_keypoints: "Future[Keypoints]"
 
@@ -85,7 +86,7 @@ def extract(scan: Scan, config: Config, beside: Aside | None = None) -> Features
 
 
 def _cloud(points: np.ndarray, seen: Masks, config: Config) -> Cloud:
-    upright = points[seen.usable & ~seen.ground]
+    upright = points[seen.standing]
     return Cloud(
         Surface.of(upright, config.shot.surface_voxel_m, config.normals.radius_m),
         tree.build(points[seen.usable & seen.ground]))
@@ -93,7 +94,7 @@ def _cloud(points: np.ndarray, seen: Masks, config: Config) -> Cloud:
 
 def _keypoints(points: np.ndarray, seen: Masks, cloud: "Future[Cloud]", config: Config) -> Keypoints:
     upright = cloud.result().upright
-    row = np.flatnonzero(seen.usable & ~seen.ground)[
+    row = np.flatnonzero(seen.standing)[
         grid.first_per_voxel(upright.points, config.matching.keypoint_voxel_m)]
     descriptors, _ = shot.describe(
         points[row], upright.points[upright.thinned], upright.normals[upright.thinned],

@@ -50,18 +50,17 @@ def detect(points: np.ndarray, kept: np.ndarray, config: GroundConfig) -> Ground
     shifted[:, 2] += height_m - _PATCHWORK_HEIGHT_M
     found = rows[_patchwork(shifted)]
     found = found[_close_to_local_ground(points[found], config.max_height_m)]
-    ground = np.zeros(len(points), bool)
-    ground[found] = True
     if len(found) == 0:
-        return Ground(ground, np.zeros(len(points), bool))
+        return Ground.none(len(points))
+    ground = Ground.none(len(points))
+    ground.mask[found] = True
     around = ground_level.flat(points[found])
-    others = rows[~ground[rows]]
-    ground[others] = _in_the_plane_around(points[others], around, config.fill_height_m)
-    reflection = np.zeros(len(points), bool)
-    low = rows[~ground[rows] & (points[rows, 2] < np.median(points[found, 2]) - _REFLECTION_DEPTH_M)]
+    others = rows[~ground.mask[rows]]
+    ground.mask[others] = _in_the_plane_around(points[others], around, config.fill_height_m)
+    low = rows[~ground.mask[rows] & (points[rows, 2] < np.median(points[found, 2]) - _REFLECTION_DEPTH_M)]
     level = ground_level.around(around, points[low], 1, np.inf)
-    reflection[low] = points[low, 2] < level - _REFLECTION_DEPTH_M
-    return Ground(ground, reflection)
+    ground.reflection[low] = points[low, 2] < level - _REFLECTION_DEPTH_M
+    return ground
 
 
 def estimate_sensor_height(points: np.ndarray) -> float | None:
