@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 
-from lidarflow.kernels import coherence, graphs, grid, linalg, matching, mesh, normals, shot
+from lidarflow.kernels import coherence, graphs, grid, linalg, matching, mesh, normals, shot, tangent_stars
 
 RADIUS_M = 1.0
 
@@ -353,11 +354,13 @@ def check_ring_edges(count: int) -> None:
     np.testing.assert_array_equal(found, expected)
 
 
+STAR_LIMITS = (0.4, 0.0, 0.36, np.radians(4.0), np.radians(45), np.radians(2), np.radians(120))
+
+
 def check_tangent_stars(count: int) -> None:
     points = bumpy_surface(count, rng(7))
     surface_normals = normals_twin(points, points, 0.5)
-    limits = (0.4, 0.0, 0.36, np.radians(4.0), np.radians(45), np.radians(2), np.radians(120))
-    triangles = mesh.tangent_stars(points, surface_normals, *limits)
+    triangles = tangent_stars.triangles(points, surface_normals, *STAR_LIMITS)
     assert (triangles[:, 0] < triangles[:, 1]).all() and (triangles[:, 1] < triangles[:, 2]).all()
     assert len(np.unique(triangles, axis=0)) == len(triangles)
     corners = points[triangles]
@@ -477,6 +480,37 @@ def test_ring_edges():
 
 def test_tangent_stars():
     check_tangent_stars(1200)
+
+
+@pytest.mark.parametrize("spacing_m", [0.25, 0.08, 0.02])
+def test_stars_of_a_plane_are_its_delaunay_triangles_however_dense(spacing_m):
+    random, many = rng(5), 1500
+    half_m = 0.5 * spacing_m * np.sqrt(many)
+    flat = random.uniform(-half_m, half_m, (many, 2))
+    points = np.column_stack([flat, np.full(many, 5.0)])
+    found = tangent_stars.triangles(points, np.tile([0.0, 0.0, 1.0], (many, 1)), *STAR_LIMITS)
+    expected = np.sort(Delaunay(flat).simplices, axis=1)
+    sides = [flat[expected[:, k]] - flat[expected[:, k - 1]] for k in range(3)]
+    lengths = np.sort([np.hypot(*side.T) for side in sides], axis=0)
+    low, middle, long = lengths
+    sharp = np.arccos(np.clip((middle**2 + long**2 - low**2) / (2 * middle * long), -1, 1))
+    blunt = np.arccos(np.clip((low**2 + middle**2 - long**2) / (2 * low * middle), -1, 1))
+    well_shaped = (sharp > np.radians(2)) & (blunt < np.radians(120)) & (long < 0.4)
+    inside = (np.abs(flat[expected]) < 0.8 * half_m).all(axis=(1, 2))
+    known = set(map(tuple, found.tolist()))
+    missed = [t for t in map(tuple, expected[well_shaped & inside].tolist()) if t not in known]
+    assert well_shaped.sum() > 1000 and len(missed) == 0
+    assert known <= set(map(tuple, expected.tolist()))
+
+
+def test_stars_do_not_join_sheets_above_one_another():
+    random = rng(6)
+    flat = random.uniform(-1.0, 1.0, (2000, 2))
+    over = np.arange(2000) % 2
+    points = np.column_stack([flat, 5.0 + 0.3 * over])
+    found = tangent_stars.triangles(points, np.tile([0.0, 0.0, 1.0], (2000, 1)), *STAR_LIMITS)
+    mixed = (over[found].min(axis=1) != over[found].max(axis=1)).mean()
+    assert len(found) > 2000 and mixed < 0.01
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarflow.config import MeshConfig
 from lidarflow.errors import DataError
-from lidarflow.kernels import graphs, normals
+from lidarflow.kernels import graphs, normals, tangent_stars
 from lidarflow.kernels import mesh as kernel
 from lidarflow.lidar import rings
 
@@ -136,7 +136,7 @@ def _tangent_triangles(
     if len(rows) < 3:
         return np.empty((0, 3), np.int32)
     point_normals = normals.estimate(points[rows], surface, normal_radius_m)
-    local = kernel.tangent_stars(
+    local = tangent_stars.triangles(
         points[rows], point_normals, *_limits(config, max_edge_rad=0.0), _MAX_SURFACE_ANGLE_RAD,
         _MIN_ANGLE_RAD, _MAX_ANGLE_RAD)
     return rows[local].astype(np.int32)
