@@ -4,12 +4,11 @@ import json
 
 import numpy as np
 
-from lidarflow import io
+from lidarflow import io, rgbd_io
 from lidarflow.checkpoints import CheckpointFiles, digest_of, naming_damage, read_bound
-from lidarflow.rgbd_types import Camera, RgbdPair, RgbdResult
+from lidarflow.rgbd_types import RgbdPair, RgbdResult
 
-_PLAIN = ("flow", "points", "valid", "label", "b", "cluster_motions", "odometry", "is_dynamic", "centres")
-_NAMES = ("digest", *_PLAIN, "camera", "notes")
+_NAMES = ("digest", *rgbd_io.RESULT_ARRAYS, "camera", "notes")
 
 
 class RgbdCheckpoints(CheckpointFiles):
@@ -17,10 +16,9 @@ class RgbdCheckpoints(CheckpointFiles):
 
     def save(self, index: int, pair: RgbdPair, result: RgbdResult, tracks: None = None) -> None:
         """Keep the answer of the pair at `index`."""
-        camera = result.camera
-        arrays = {name: getattr(result, name) for name in _PLAIN} | {
+        arrays = {name: getattr(result, name) for name in rgbd_io.RESULT_ARRAYS} | {
             "digest": np.array(_digest(pair)), "notes": np.array(json.dumps({"seconds": result.seconds})),
-            "camera": np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy])}
+            "camera": rgbd_io.camera_row(result.camera)}
         self.put(index, io.archive(arrays))
 
     def load(self, index: int, pair: RgbdPair) -> tuple[RgbdResult, None]:
@@ -28,11 +26,10 @@ class RgbdCheckpoints(CheckpointFiles):
         file = self.file(index)
         arrays = read_bound(file, _NAMES, _digest(pair), (pair.source.name, pair.target.name))
         with naming_damage(file):
-            width, height, *intrinsics = arrays["camera"].tolist()
             return RgbdResult(
-                camera=Camera(int(width), int(height), *intrinsics),
+                camera=rgbd_io.camera_of(arrays["camera"]),
                 seconds=json.loads(str(arrays["notes"]))["seconds"],
-                **{name: arrays[name] for name in _PLAIN}), None
+                **{name: arrays[name] for name in rgbd_io.RESULT_ARRAYS}), None
 
 
 def _digest(pair: RgbdPair) -> str:

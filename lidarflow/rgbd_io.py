@@ -22,6 +22,9 @@ _ARRAYS = {
     "stats": ("", "U"),
 }
 _MARK = "cluster_motions"
+# arrays of RgbdResult that flow files and checkpoints hold under their own names
+RESULT_ARRAYS = (
+    "flow", "points", "valid", "label", "b", "cluster_motions", "odometry", "is_dynamic", "centres")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +53,7 @@ def save_flow(path: Path, source: RgbdFrame, result: RgbdResult, config: RgbdCon
         "b": result.b.astype(np.float64), "centres": result.centres.astype(np.float32),
         "cluster_motions": result.cluster_motions.astype(np.float64),
         "odometry": result.odometry.astype(np.float64),
-        "camera": np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]),
+        "camera": camera_row(camera),
         "config": np.array(io.as_json(settings.to_dict(config))), "stats": np.array(io.as_json(stats)),
     }
     with io.written_aside(path) as aside:
@@ -69,11 +72,8 @@ def load_flow(path: Path) -> RgbdFlowFile:
                             f"{expected} of the kind that lidarflow writes")
     try:
         found = {name: json.loads(str(arrays[name])) for name in ("config", "stats")}
-        width, height, *intrinsics = arrays["camera"].tolist()
         result = RgbdResult(
-            **{name: arrays[name] for name in ("flow", "points", "valid", "label", "b", "cluster_motions",
-                                               "odometry", "is_dynamic", "centres")},
-            camera=Camera(int(width), int(height), *intrinsics))
+            **{name: arrays[name] for name in RESULT_ARRAYS}, camera=camera_of(arrays["camera"]))
         if not all(isinstance(value, dict) for value in found.values()):
             raise ValueError("config and stats are no tables")
         if not pose.is_rigid(result.cluster_motions, 1e-4):
@@ -93,6 +93,17 @@ def is_rgbd_flow(path: Path) -> bool:
             return f"{_MARK}.npy" in archive.namelist()
     except (OSError, zipfile.BadZipFile):
         return False
+
+
+def camera_row(camera: Camera) -> np.ndarray:
+    """Width, height, fx, fy, cx, cy in pixels as (6,) float64."""
+    return np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy])
+
+
+def camera_of(row: np.ndarray) -> Camera:
+    """The camera that `camera_row` made `row` of; ValueError or OverflowError where there is none."""
+    width, height, *intrinsics = row.tolist()
+    return Camera(int(width), int(height), *intrinsics)
 
 
 def color_at(frame: RgbdFrame, width: int, height: int) -> np.ndarray:

@@ -7,18 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, metrics, pose, provenance, rgbd_io, rgbd_methods, rgbd_metrics, rgbd_preview
+from lidarflow import io, metrics, pose, rgbd_io, rgbd_methods, rgbd_metrics, rgbd_preview
 from lidarflow.datasets.rgbd_folders import RgbdFolder
 from lidarflow.resuming import Plan
 from lidarflow.rgbd_checkpoints import RgbdCheckpoints
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_metrics import DepthStatistics, Drift, RgbdScores, WarpScores
 from lidarflow.rgbd_types import RgbdPair, RgbdResult, RgbdTruth
-from lidarflow.runner import Going, Viewing, begun_steps, plain_skipped, plan_of, recording
+from lidarflow.runner import OUTPUT_STAGE, Going, Viewing, begun_steps, finish, plan_of, recording
 from lidarflow.stepping import Step, Walk
 from lidarflow.trajectory import Trajectory
-
-OUTPUT_STAGE = "scores and output"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +73,7 @@ def process(
     way.write_tum(out)
     with io.written_aside(out / "preview.png") as aside:
         rgbd_preview.write_preview(aside, step.pair.source, step.result)
-    provenance.write(out, replace(plan.source, skipped=tuple(frame.index for frame in skipped)))
-    io.write_json(out / io.METRICS_FILE, {**metrics_of(run), **plain_skipped(skipped)})
-    io.write_json(out / "timing.json", {report.frame: report.seconds for report in reports})
-    kept.remove()
-    io.link_latest(out)
+    finish(out, plan, kept, skipped, metrics_of(run), {report.frame: report.seconds for report in reports})
     return run
 
 

@@ -5,8 +5,9 @@ from rich import box
 from rich.table import Table
 
 from lidarflow import pose
-from lidarflow.rgbd_runner import OUTPUT_STAGE, RgbdReport, RgbdRun, figures_of, mean_of
+from lidarflow.rgbd_runner import RgbdReport, RgbdRun, figures_of, mean_of
 from lidarflow.rgbd_types import RgbdPair, RgbdResult
+from lidarflow.runner import OUTPUT_STAGE
 
 # name: (heading, factor, decimals)
 _COLUMNS = {

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarflow import io, methods, metrics, pose, preview, provenance, resuming
 from lidarflow.aside import ahead
-from lidarflow.checkpoints import Checkpoints
+from lidarflow.checkpoints import CheckpointFiles, Checkpoints
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.errors import DataError
@@ -26,6 +26,8 @@ from lidarflow.types import FlowResult, Scan, ScanPair, SolveStats, Truth
 if TYPE_CHECKING:
     from lidarflow.datasets.rgbd_folders import RgbdFolder
     from lidarflow.rgbd_config import RgbdConfig
+
+OUTPUT_STAGE = "scores and output"     # the stage after those of the method itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +123,7 @@ def process(
     io.write_objects(out / io.OBJECTS_FILE, objects)
     with io.written_aside(out / "preview.png") as aside:
         preview.write_preview(aside, step.pair, step.result)
-    provenance.write(out, replace(plan.source, skipped=tuple(scan.index for scan in skipped)))
-    io.write_json(out / io.METRICS_FILE, {**metrics_of(reports, config), **plain_skipped(skipped)})
-    io.write_json(out / "timing.json", {r.frame: r.seconds for r in reports})
-    kept.remove()
-    io.link_latest(out)
+    finish(out, plan, kept, skipped, metrics_of(reports, config), {r.frame: r.seconds for r in reports})
     return reports
 
 
@@ -140,9 +138,8 @@ def begun_steps(walk: Walk, plan: Plan, kept: Kept, out: Path, going: Going
     """The pairs of a run, whose folder `out` is ready for results, and the scans that are left out.
 
     Those come to the list as the pairs are gone through. The next pair is read and computed while one is
-    written. The first pair is done before the folder is touched:
-    bad data leave no empty run behind. Raises LidarflowError where nothing can be used or `out` holds
-    another run.
+    written. The first pair is done before the folder is touched: bad data leave no empty run behind. Raises
+    LidarflowError where nothing can be used or `out` holds another run.
     """
     skipped: list[Skipped] = []
 
@@ -163,6 +160,22 @@ def begun_steps(walk: Walk, plan: Plan, kept: Kept, out: Path, going: Going
     else:
         resuming.begin(out, plan)
     return ahead(itertools.chain([first], done)), skipped
+
+
+def finish(
+    out: Path, plan: Plan, kept: CheckpointFiles, skipped: list[Skipped], figures: dict,
+    seconds: dict[str, dict[str, float]],
+) -> None:
+    """Make a run complete whose results are in `out`: its checkpoints go, and it becomes the latest.
+
+    figures  what metrics.json holds, but for the scans that are left out
+    seconds  by frame and stage
+    """
+    provenance.write(out, replace(plan.source, skipped=tuple(scan.index for scan in skipped)))
+    io.write_json(out / io.METRICS_FILE, {**figures, **_plain_skipped(skipped)})
+    io.write_json(out / "timing.json", seconds)
+    kept.remove()
+    io.link_latest(out)
 
 
 def begin(dataset: Dataset, frames: list[int], config: Config, out: Path, method: str, going: Going
@@ -197,11 +210,10 @@ def _write_pair(
         score = (report.alignment.before, report.alignment.after)
         viewer.log_pair(stream, step.index, pair, result, score, world_from_source, arrows)
     way.add(step.index, pair, result.ego_motion)
-    return replace(report, seconds={
-        **report.seconds, "scores and output": time.perf_counter() - begin})
+    return replace(report, seconds={**report.seconds, OUTPUT_STAGE: time.perf_counter() - begin})
 
 
-def plain_skipped(skipped: list[Skipped]) -> dict:
+def _plain_skipped(skipped: list[Skipped]) -> dict:
     """What metrics.json says of scans that were left out; nothing where there are none."""
     return {"skipped": [{"scan": scan.index, "reason": scan.reason} for scan in skipped]} if skipped else {}
 

@@ -10,7 +10,6 @@ The last line is for the estimate of hours in README.md. Exits with 1 where the 
 """
 
 import argparse
-import hashlib
 import json
 import statistics
 import subprocess
@@ -19,15 +18,10 @@ import tempfile
 import time
 from pathlib import Path
 
+from evaluate import table
+from soak import digest
 
-def digest(folder: Path) -> str:
-    """One hash over names and contents of all files of a run but its times."""
-    found = hashlib.sha256()
-    for file in sorted(folder.rglob("*")):
-        if file.is_file() and file.name != "timing.json":
-            found.update(str(file.relative_to(folder)).encode())
-            found.update(file.read_bytes())
-    return found.hexdigest()
+from lidarflow.runner import OUTPUT_STAGE
 
 
 def seconds_of(data: Path, out: Path, options: list[str]) -> float:
@@ -69,12 +63,12 @@ def main() -> None:
     median = {way: statistics.median(taken) for way, taken in seconds.items()}
     one, several = (way for way in ways if "worker" in way)
     print(f"{given.folder.name}: {pairs} pairs, {given.times} times each\n")
-    print("| way | s | s / pair | times one worker |\n| --- | --- | --- | --- |")
-    for way, took in median.items():
-        print(f"| {way} | {took:.1f} | {took / pairs:.2f} | {median[one] / took:.2f} |")
+    print(table(["way", "s", "s / pair", "times one worker"],
+                [[way, f"{took:.1f}", f"{took / pairs:.2f}", f"{median[one] / took:.2f}"]
+                 for way, took in median.items()]))
     is_same = made[one] == made[several]
     print(f"\nfiles of {one} and of {several}: {'the same' if is_same else 'NOT THE SAME'}")
-    output = statistics.median(stages["scores and output"] for stages in timing.values())
+    output = statistics.median(stages[OUTPUT_STAGE] for stages in timing.values())
     whole = statistics.median(sum(stages.values()) for stages in timing.values())
     print(f"with one thread: {whole - output:.2f} s a pair, {output:.2f} s of output a pair")
     if not is_same:

@@ -1,6 +1,6 @@
 """Process the same scans again and again: memory, threads and open files must not grow, results not change.
 
-    python scripts/soak.py FOLDER [--rounds 10] [--scans N] [--solver fast] [--record]
+    python scripts/soak.py FOLDER [--rounds 10] [--scans N] [--solver gtsam] [--record]
 
 FOLDER is any data set, e.g. the 52 range images of moosmann_durlacher_tor. Every round is a run as
 `lidarflow run` makes it, all in one process. Prints a row a round and says in the end whether the rounds were
@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 from lidarflow import runner
-from lidarflow.config import load
+from lidarflow.config import SolverConfig, load
 from lidarflow.datasets import open_dataset
 
 TIMED = ("timing.json", "recording.rrd")     # hold times, and ids that are drawn anew
@@ -84,7 +84,7 @@ def main():
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--scans", type=int)
     parser.add_argument("--method", default="ours")
-    parser.add_argument("--solver", default="gtsam")
+    parser.add_argument("--solver", default=SolverConfig().method)
     parser.add_argument("--record", action="store_true",
                         help="record too; rerun 0.41 keeps some threads of every recording")
     options = parser.parse_args()

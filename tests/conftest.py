@@ -1,4 +1,4 @@
-"""What several test modules begin with: the program, and a small drive on disk."""
+"""What several test modules begin with: the program, where it is run, and a small drive on disk."""
 
 import pytest
 from command_line import Program, drive
@@ -9,6 +9,12 @@ from lidarflow import synthetic
 @pytest.fixture
 def lidarflow(monkeypatch, capsys):
     return Program(monkeypatch, capsys)
+
+
+@pytest.fixture
+def in_tmp_path(monkeypatch, tmp_path):
+    """Stay in the test's own folder: what is written to a relative place lands there."""
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture(scope="session")

@@ -27,6 +27,11 @@ def write_run(run_dir, dataset, scans):
     return run_dir
 
 
+def flows(run_dir):
+    """What the flow files of a run hold, in order."""
+    return [io.load_flow(file) for file in sorted((run_dir / "flow").iterdir())]
+
+
 def answer(scan, truth):
     """The true flow, static points off by OFF_M; no motion and no movers where there is no truth."""
     n = len(scan)

@@ -6,19 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cloud_files import write_bin
-from command_line import Program, drive, rests
+from command_line import drive, rests
 
 from lidarflow import io, synthetic
+
+pytestmark = pytest.mark.usefixtures("in_tmp_path")
 
 RNG = np.random.default_rng(5)
 GROUND = np.column_stack([RNG.uniform(-20, 20, (4000, 2)), np.full(4000, -1.73)])
 WALL = np.column_stack([np.full(4000, 10.0), RNG.uniform(-15, 15, 4000), RNG.uniform(-1.5, 3, 4000)])
-
-
-@pytest.fixture
-def lidarflow(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    return Program(monkeypatch, capsys)
 
 
 @pytest.fixture

@@ -6,20 +6,16 @@ import shutil
 import numpy as np
 import pytest
 from cloud_files import write_bin
-from command_line import Program, drive, rests
+from command_line import drive, rests
 from run_folders import OFF_M, write_run
 
 from lidarflow import provenance, synthetic
 from lidarflow.datasets import open_dataset
 from lidarflow.types import Scan, Truth
 
+pytestmark = pytest.mark.usefixtures("in_tmp_path")
+
 SCANS = ("000000", "000001")
-
-
-@pytest.fixture
-def lidarflow(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    return Program(monkeypatch, capsys)
 
 
 @pytest.fixture

@@ -7,23 +7,19 @@ import sys
 import numpy as np
 import pytest
 from argoverse_log import TIMES, write_log
-from command_line import Program, drive, rests
-from run_folders import STATS, write_run
+from command_line import drive, rests
+from run_folders import STATS, flows, write_run
 
 from lidarflow import colour, config, export, io, pose, provenance, synthetic
 from lidarflow.datasets import open_dataset, read_points
 from lidarflow.datasets.argoverse2 import read_columns
 from lidarflow.types import FlowResult
 
+pytestmark = pytest.mark.usefixtures("in_tmp_path")
+
 LOG = "7fab"
 FLOW_COLUMNS = ["flow_tx_m", "flow_ty_m", "flow_tz_m"]
 HALF_PRECISION = 2.0 ** -11     # relative, of float16
-
-
-@pytest.fixture
-def lidarflow(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    return Program(monkeypatch, capsys)
 
 
 @pytest.fixture
@@ -46,10 +42,6 @@ def make_unknown(file):
     found = io.load_flow(file)
     found.points[0] = found.flow[0] = np.nan
     io.save_flow(file, found.points, found.result(), config.updated(config.Config(), found.config, str(file)))
-
-
-def flows(run_dir):
-    return [io.load_flow(file) for file in sorted((run_dir / "flow").iterdir())]
 
 
 def table(file):

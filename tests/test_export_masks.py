@@ -6,10 +6,10 @@ import zipfile
 import numpy as np
 import pytest
 from argoverse_log import TIMES, write_log
-from command_line import Program, rests
-from run_folders import write_run
+from command_line import rests
+from run_folders import flows, write_run
 
-from lidarflow import export, io
+from lidarflow import export
 from lidarflow.datasets import open_dataset
 from lidarflow.datasets.argoverse2 import read_columns
 from lidarflow.export.argoverse2 import COLUMNS
@@ -17,16 +17,12 @@ from lidarflow.export.argoverse2 import COLUMNS
 pyarrow = pytest.importorskip("pyarrow")
 feather = pytest.importorskip("pyarrow.feather")
 
+pytestmark = pytest.mark.usefixtures("in_tmp_path")
+
 LOG, OTHER_LOG = "7fab", "8abc"
 POINTS = 8
 FIRST, SECOND = f"{LOG}/{TIMES[0]}.feather", f"{LOG}/{TIMES[1]}.feather"
 SOME = np.array([True, False, False, True, True, False, True, False])
-
-
-@pytest.fixture
-def lidarflow(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    return Program(monkeypatch, capsys)
 
 
 @pytest.fixture
@@ -49,10 +45,6 @@ def write_masks(file, members):
         for name, mask in members.items():
             archive.writestr(name, mask if isinstance(mask, bytes) else packed(mask))
     return file
-
-
-def flows(run):
-    return [io.load_flow(file) for file in sorted((run / "flow").iterdir())]
 
 
 def test_only_counted_sweeps_and_points_are_written(lidarflow, run, tmp_path):

@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from command_line import Program, drive, rests
+from command_line import drive, rests
 from PIL import Image
 from run_folders import CONFIG, OFF_M, write_run
 from test_preview import MOVER, street
@@ -24,13 +24,9 @@ from lidarflow.report.rebuilding import rebuilt
 from lidarflow.runner import PairReport
 from lidarflow.types import Truth
 
+pytestmark = pytest.mark.usefixtures("in_tmp_path")
+
 EVIL = "<script>alert(1)<"     # a folder's name holds no slash
-
-
-@pytest.fixture
-def lidarflow(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    return Program(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from command_line import Program, rests
+from command_line import rests
 from PIL import Image
 from rgbd_worlds import FRAMES, QVGA, copied, frames
 
@@ -18,6 +18,8 @@ from lidarflow.datasets.rgbd_images import read_frame
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_types import RgbdPair
 
+pytestmark = pytest.mark.usefixtures("in_tmp_path")
+
 CONTRACT = {"flow": ("float32", (240, 320, 3)), "valid": ("bool", (240, 320)), "label": ("int32", (240, 320)),
             "points": ("float32", (240, 320, 3)), "is_dynamic": ("bool", (240, 320)),
             "color": ("uint8", (240, 320, 3)), "odometry": ("float64", (4, 4)), "camera": ("float64", (6,))}
@@ -26,12 +28,6 @@ RUN_FILES = {"config.toml", "flow", "metrics.json", "poses_tum.txt", "preview.pn
 PROGRAM = (sys.executable, "-c", "from lidarflow.cli import main; main()")
 SAME = ("config.toml", "metrics.json", "poses_tum.txt", "preview.png")
 HEAVY = ("gtsam", "open3d", "numba", "rerun", "scipy", "PIL", "numpy")
-
-
-@pytest.fixture
-def lidarflow(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    return Program(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="session")

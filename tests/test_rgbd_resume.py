@@ -5,7 +5,6 @@ import os
 
 import numpy as np
 import pytest
-from command_line import Program
 from killed import contents, program, was_killed
 from rgbd_worlds import QVGA, frames
 
@@ -21,11 +20,6 @@ from lidarflow.stepping import Walk, steps
 QUIET = Viewing(record=False)
 FRAMES = 5
 NAMES = ("0.000000", "0.033333", "0.066667", "0.100000", "0.133333")
-
-
-@pytest.fixture
-def lidarflow(monkeypatch, capsys):
-    return Program(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="module")
