@@ -6,6 +6,8 @@ import numpy as np
 from lidarflow.kernels import grid
 from lidarflow.kernels.compiled import njit
 
+_PLACES = 4     # of queries that are looked at together, along each side of a gate
+
 
 def best_in_gate(
     centres: np.ndarray, descriptors: np.ndarray, candidates: np.ndarray,
@@ -18,10 +20,10 @@ def best_in_gate(
     (Q,) of the best and of the best candidate farther than `rival_radius_m` from it (inf without one).
     """
     order, keys, lower, shape = grid.build(candidates, gate_m)
-    # Queries of one place share their candidates, which stay at hand when they come one after the other.
-    by_place, *_ = grid.build(centres, gate_m)
+    # Two queries of one place share their candidates: what is read for one serves the other.
+    by_place, *_ = grid.build(centres, gate_m / _PLACES)
     best, best_sq, rival_sq = _best_in_gate(
-        centres, descriptors, by_place, candidates[order], candidate_descriptors[order], keys, lower, shape,
+        centres, descriptors, by_place, candidates[order], candidate_descriptors, order, keys, lower, shape,
         gate_m, rival_radius_m)
     found = best >= 0
     best[found] = order[best[found]]
@@ -29,45 +31,80 @@ def best_in_gate(
 
 
 @njit(fastmath=True)
-def _dot(a, b):
-    total = np.float32(0.0)
+def _products(a, b, c, d):
+    """Inner products of a with c and d, and of b with c and d; each number is read half as often."""
+    a_c, a_d, b_c, b_d = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for k in range(len(a)):
-        total += a[k] * b[k]
-    return total
+        of_a, of_b, of_c, of_d = a[k], b[k], c[k], d[k]
+        a_c += of_a * of_c
+        a_d += of_a * of_d
+        b_c += of_b * of_c
+        b_d += of_b * of_d
+    return a_c, a_d, b_c, b_d
 
 
 @njit(parallel=True)
 def _best_in_gate(
-    centres, descriptors, by_place, candidates, candidate_descriptors, keys, lower, shape, gate_m,
+    centres, descriptors, by_place, candidates, candidate_descriptors, order, keys, lower, shape, gate_m,
     rival_radius_m
 ):
     n = len(centres)
     best = np.full(n, -1, np.int64)
     best_sq, rival_sq = np.full(n, np.inf), np.full(n, np.inf)
-    for visit in numba.prange(n):
-        i = by_place[visit]
-        starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
-        run_count = grid.runs(centres[i], keys, lower, shape, gate_m, starts, ends)
-        room = grid.room(starts, ends, run_count)
-        index, distance_sq = np.empty(room, np.int64), np.empty(room)
-        count = 0
-        for run in range(run_count):
-            for j in range(starts[run], ends[run]):
-                if _distance_sq(centres[i], candidates[j]) > gate_m * gate_m:
-                    continue
-                index[count] = j
-                distance_sq[count] = max(0.0, 2.0 - 2.0 * _dot(descriptors[i], candidate_descriptors[j]))
-                if distance_sq[count] < best_sq[i]:
-                    best_sq[i], best[i] = distance_sq[count], j
-                count += 1
-        for k in range(count):
-            if distance_sq[k] < rival_sq[i]:
-                apart_sq = _distance_sq(candidates[index[k]], candidates[best[i]])
-                if apart_sq > rival_radius_m * rival_radius_m:
-                    rival_sq[i] = distance_sq[k]
+    for couple in numba.prange((n + 1) // 2):
+        a, b = by_place[2 * couple], by_place[min(2 * couple + 1, n - 1)]
+        near = _near_either(centres[a], centres[b], candidates, keys, lower, shape, gate_m)
+        products = np.empty((2, len(near)), np.float32)
+        for k in range(0, len(near), 2):
+            last = min(k + 1, len(near) - 1)
+            products[0, k], products[0, last], products[1, k], products[1, last] = _products(
+                descriptors[a], descriptors[b], candidate_descriptors[order[near[k]]],
+                candidate_descriptors[order[near[last]]])
+        for slot in range(2):
+            i = b if slot else a
+            best[i], best_sq[i], rival_sq[i] = _best_and_rival(
+                centres[i], candidates, near, products[slot], gate_m, rival_radius_m)
     return best, best_sq, rival_sq
 
 
 @njit()
+def _near_either(a, b, candidates, keys, lower, shape, gate_m):
+    """The candidates (n,) within the gate around a or around b, (3,) each."""
+    starts, ends = np.empty(18, np.int64), np.empty(18, np.int64)
+    cell_a, cell_b = grid.cell_of(a, lower, gate_m), grid.cell_of(b, lower, gate_m)
+    of_a = count = grid.runs_around(cell_a, keys, shape, starts, ends)
+    if cell_b != cell_a:
+        count += grid.runs_around(cell_b, keys, shape, starts[of_a:], ends[of_a:])
+    near, found = np.empty(grid.room(starts, ends, count), np.int64), 0
+    gate_sq = gate_m * gate_m
+    for run in range(count):
+        for j in range(starts[run], ends[run]):
+            near_a = _distance_sq(a, candidates[j]) <= gate_sq
+            near_b = _distance_sq(b, candidates[j]) <= gate_sq
+            # What is near to a has been found by the runs of a.
+            if near_b and not near_a if run >= of_a else near_a or (near_b and cell_a == cell_b):
+                near[found] = j
+                found += 1
+    return near[:found]
+
+
+@njit()
+def _best_and_rival(centre, candidates, near, products, gate_m, rival_radius_m):
+    """The best candidate, -1 for none, and the squared distances of it and of its rival."""
+    best, best_sq, rival_sq = -1, np.inf, np.inf
+    distance_sq = np.full(len(near), np.inf)
+    for k in range(len(near)):
+        if _distance_sq(centre, candidates[near[k]]) <= gate_m * gate_m:
+            distance_sq[k] = max(0.0, 2.0 - 2.0 * products[k])
+            if distance_sq[k] < best_sq:
+                best_sq, best = distance_sq[k], near[k]
+    for k in range(len(near)):
+        if distance_sq[k] < rival_sq and (
+                _distance_sq(candidates[near[k]], candidates[best]) > rival_radius_m * rival_radius_m):
+            rival_sq = distance_sq[k]
+    return best, best_sq, rival_sq
+
+
+@njit(inline="always")
 def _distance_sq(a, b):
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
