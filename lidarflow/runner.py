@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarflow import io, methods, metrics, pose, preview, provenance, resuming
-from lidarflow.aside import ahead
+from lidarflow.aside import Aside, ahead, there
 from lidarflow.checkpoints import CheckpointFiles, Checkpoints
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
@@ -200,9 +200,13 @@ def _write_pair(
     """Write the flow file of a pair, log it, lengthen the way by it, and report it."""
     begin, pair, result = time.perf_counter(), step.pair, step.result
     file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
-    if not (step.restored and file.is_file()):     # a checkpoint is younger than its flow file
-        io.save_flow(file, pair.source.points, result, config)
-    report = report_pair(dataset, step.index, pair, result, config)
+    with Aside() as beside:
+        if not (step.restored and file.is_file()):     # a checkpoint is younger than its flow file
+            saved = beside.begin(io.save_flow, file, pair.source.points, result, config)
+        else:
+            saved = there(None)
+        report = report_pair(dataset, step.index, pair, result, config)
+        saved.result()
     world_from_source = way.reached(step.index)
     if stream is not None:
         from lidarflow import viewer
