@@ -220,6 +220,8 @@ def test_part_of_a_sequence_by_another_method(lidarflow, folder, tmp_path):
     assert len(np.loadtxt(tmp_path / "part" / "poses_tum.txt")) == 2
     assert json.loads((tmp_path / "part" / "metrics.json").read_text())["method"] == "open3d"
     lidarflow.ok("view", "part", "--save", "copy.rrd")
+    for command in ("report", "eval"):
+        assert "part: is a run of RGB-D images; expected one of LiDAR" in lidarflow.complaint(command, "part")
     assert (tmp_path / "copy.rrd").read_bytes() == (tmp_path / "part" / "recording.rrd").read_bytes()
 
 

@@ -79,9 +79,10 @@ def read_run(run_dir: Path, most_pictured: int = MOST_PICTURED) -> Run:
     Raises DataError for a folder that is no run, and for files that are missing or damaged. Data that are not
     at hand any more only cost the error maps.
     """
-    figures = read_figures(run_dir)
-    pairs, file = figures["pairs"], run_dir / io.METRICS_FILE
+    found = _read_metrics(run_dir)
     source, config = provenance.read(run_dir), load(run_dir / io.CONFIG_FILE)
+    figures = _figures(found, run_dir)
+    pairs, file = figures["pairs"], run_dir / io.METRICS_FILE
     if len(pairs) != len(source.pairs):
         raise DataError(f"{file}: {len(pairs)} pairs, but {io.SOURCE_FILE} names the scans of "
                         f"{len(source.pairs)}; run again")
@@ -93,7 +94,11 @@ def read_run(run_dir: Path, most_pictured: int = MOST_PICTURED) -> Run:
 
 def read_figures(run_dir: Path) -> dict:
     """What metrics.json of a run folder holds, by the names that `Run` has for it; DataError if damaged."""
-    found, file = _read_metrics(run_dir), run_dir / io.METRICS_FILE
+    return _figures(_read_metrics(run_dir), run_dir)
+
+
+def _figures(found: dict, run_dir: Path) -> dict:
+    file = run_dir / io.METRICS_FILE
     try:
         return {
             "pairs": rebuilt(tuple[PairReport, ...], found["pairs"], "pairs"),
