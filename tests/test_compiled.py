@@ -36,6 +36,12 @@ def test_another_source_has_another_cache(package):
     assert compiled.cache_folder(package, "") != before
 
 
+def test_another_numba_has_another_cache(package, monkeypatch):
+    before = compiled.cache_folder(package, "")
+    monkeypatch.setattr(numba, "__version__", "0.1")
+    assert compiled.cache_folder(package, "") != before
+
+
 def test_a_wanted_folder_is_used(package, tmp_path):
     assert compiled.cache_folder(package, str(tmp_path / "mine")).parent == tmp_path / "mine"
     assert not (package / "__pycache__").exists()

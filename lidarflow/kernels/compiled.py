@@ -1,7 +1,8 @@
 """How kernels are compiled: once, into a cache that knows the sources of all of them.
 
 numba's cache watches a function's own file only: after an update it would go on using code with other files'
-old functions inside. The cache therefore has a folder for each state of the sources.
+old functions inside, and two versions of numba that share a cache make each other compile anew every time.
+The cache therefore has a folder for each state of the sources and version of numba.
 """
 
 import hashlib
@@ -20,7 +21,7 @@ def cache_folder(package: Path, wanted: str) -> Path:
 
     An installation may be read-only; `wanted` is what NUMBA_CACHE_DIR says, or empty.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(numba.__version__.encode())
     for source in sorted(package.glob("*.py")):
         digest.update(source.read_bytes())
     state = f"lidarflow-{digest.hexdigest()[:16]}"
