@@ -1,13 +1,35 @@
 """Work beside the thread that asks for it: two cores are rarely both busy with one kernel after the other."""
 
+import contextlib
+import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import ParamSpec, TypeVar
 
 import numba
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+# Threads with nothing to do. A new one every time would bring new threads for its kernels, and memory of its
+# own to each of them.
+_idle: list[ThreadPoolExecutor] = []
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_idle.clear)     # a child has none of them
+
+
+@contextlib.contextmanager
+def _borrowed() -> Iterator[ThreadPoolExecutor]:
+    """One thread, for the caller alone until it is given back."""
+    try:
+        thread = _idle.pop()
+    except IndexError:
+        thread = ThreadPoolExecutor(1, "lidarflow")
+    try:
+        yield thread
+    finally:
+        _idle.append(thread)
 
 
 class Aside:
@@ -18,20 +40,25 @@ class Aside:
     """
 
     def __init__(self) -> None:
-        self._thread = ThreadPoolExecutor(1, "lidarflow") if numba.get_num_threads() > 1 else None
+        self._lent = contextlib.ExitStack()
+        self._thread: ThreadPoolExecutor | None = None
+        self._begun: list[Future] = []
 
     def __enter__(self) -> "Aside":
+        if numba.get_num_threads() > 1:
+            self._thread = self._lent.enter_context(_borrowed())
+            self._lent.callback(wait, self._begun)
         return self
 
     def __exit__(self, *_error: object) -> None:
-        if self._thread:
-            self._thread.shutdown()
+        self._lent.close()
 
     def begin(self, function: Callable[P, T], *given: P.args, **named: P.kwargs) -> "Future[T]":
         """Begin a call; result() of what is returned waits for it, and raises what it raised."""
-        if self._thread:
-            return self._thread.submit(function, *given, **named)
-        return done(function, *given, **named)
+        if self._thread is None:
+            return done(function, *given, **named)
+        self._begun.append(self._thread.submit(function, *given, **named))
+        return self._begun[-1]
 
 
 def done(function: Callable[P, T], *given: P.args, **named: P.kwargs) -> "Future[T]":
@@ -56,8 +83,11 @@ def ahead(items: Iterator[T]) -> Iterator[T]:
         yield from items
         return
     end = object()
-    with ThreadPoolExecutor(1, "lidarflow") as thread:
+    with _borrowed() as thread:
         begun = thread.submit(next, items, end)
-        while (item := begun.result()) is not end:
-            begun = thread.submit(next, items, end)
-            yield item  # type: ignore[misc]
+        try:
+            while (item := begun.result()) is not end:
+                begun = thread.submit(next, items, end)
+                yield item  # type: ignore[misc]
+        finally:
+            wait([begun])     # before another has the thread

@@ -1,5 +1,8 @@
 """Work beside the main thread is done in order, reports its failures, and is over when it is left."""
 
+import os
+import subprocess
+import sys
 import threading
 import time
 
@@ -85,9 +88,51 @@ def test_items_are_made_one_by_one_where_kernels_have_one_thread():
 
 
 @needs_two_threads
-def test_whoever_stops_early_leaves_no_thread_behind():
+def test_whoever_stops_early_leaves_a_thread_that_the_next_one_uses():
+    used, made = set(), []
+
+    def idents():
+        while True:
+            made.append(threading.get_ident())
+            yield made[-1]
+
+    with Aside() as beside:
+        used.add(beside.begin(threading.get_ident).result())
     begun = threading.active_count()
-    items = ahead(iter(range(10)))
-    assert next(items) == 0
-    items.close()
-    assert threading.active_count() == begun
+    for _ in range(5):
+        items = ahead(idents())
+        used.add(next(items))
+        items.close()
+        so_far = len(made)
+        time.sleep(0.01)
+        assert len(made) == so_far
+    assert threading.active_count() == begun and len(used) == 1
+
+
+@needs_two_threads
+def test_work_within_work_has_threads_of_its_own():
+    def inner() -> int:
+        with Aside() as beside:
+            return beside.begin(threading.get_ident).result()
+
+    with Aside() as beside:
+        outer = beside.begin(threading.get_ident).result()
+        assert len({outer, beside.begin(inner).result(), threading.get_ident()}) == 3
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+@needs_two_threads
+def test_a_forked_child_begins_threads_of_its_own():
+    program = """
+import os, sys
+from lidarflow.aside import Aside
+with Aside() as beside:
+    beside.begin(int, "1").result()
+child = os.fork()
+with Aside() as beside:
+    found = beside.begin(int, "7").result()
+if child == 0:
+    os._exit(found)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 7
