@@ -96,6 +96,8 @@ def recorded(folder: Path, n_scans: int | None) -> Sequence:
     scans = [dataset.scan(frame) for frame in frames]
     truths = [runner.find_truth(dataset, frame, ScanPair(*scans[k:k + 2]))[0]
               for k, frame in enumerate(frames[:-1])]
+    if None in truths:
+        raise SystemExit(f"{folder}: no truth, neither flow nor poses; give a folder that has one")
     return scans, truths
 
 
