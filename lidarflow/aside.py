@@ -52,6 +52,7 @@ class Aside:
 
     def __exit__(self, *_error: object) -> None:
         self._lent.close()
+        self._thread = None     # another may have it by now
 
     def begin(self, function: Callable[P, T], *given: P.args, **named: P.kwargs) -> "Future[T]":
         """Begin a call; result() of what is returned waits for it, and raises what it raised."""
