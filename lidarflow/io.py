@@ -32,7 +32,8 @@ SOURCE_FILE = "source.json"
 METRICS_FILE = "metrics.json"
 RECORDING_FILE = "recording.rrd"
 OBJECTS_FILE = "objects.csv"
-RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", METRICS_FILE, "timing.json", SOURCE_FILE, OBJECTS_FILE,
+TIMING_FILE = "timing.json"      # what a run writes last
+RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", METRICS_FILE, TIMING_FILE, SOURCE_FILE, OBJECTS_FILE,
                 RECORDING_FILE, "preview.png")
 OBJECT_COLUMNS = ("frame", "id", "points", "x", "y", "z", "length", "width", "height", "yaw",
                   "vx", "vy", "vz", "speed_m_per_s")

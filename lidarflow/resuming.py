@@ -12,7 +12,6 @@ from lidarflow.provenance import RunSource
 from lidarflow.rgbd_config import RgbdConfig
 
 _NAMED = 3                     # how many settings a message shows
-_LAST_FILE = "timing.json"     # what a run writes last
 
 
 class State(Enum):
@@ -55,7 +54,7 @@ def state_of(out: Path, plan: Plan) -> State:
     chunks.
     """
     begun = any((out / io.RESUME_FOLDER).rglob("*.npz"))
-    if not begun and not (out / _LAST_FILE).is_file():
+    if not begun and not (out / io.TIMING_FILE).is_file():
         return State.NEW
     if not (out / io.CONFIG_FILE).is_file():
         raise DataError(f"--resume: {out} has no {io.CONFIG_FILE}, so what it was made with is unknown; "

@@ -173,7 +173,7 @@ def finish(
     """
     provenance.write(out, replace(plan.source, skipped=tuple(scan.index for scan in skipped)))
     io.write_json(out / io.METRICS_FILE, {**figures, **_plain_skipped(skipped)})
-    io.write_json(out / "timing.json", seconds)
+    io.write_json(out / io.TIMING_FILE, seconds)
     kept.remove()
     io.link_latest(out)
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from evaluate import table
 from soak import digest
 
+from lidarflow import io
 from lidarflow.runner import OUTPUT_STAGE
 
 
@@ -71,7 +72,7 @@ def main() -> None:
                 seconds[way].append(seconds_of(data, out, options))
                 made[way] = digest(out)
                 if way == "1 worker":
-                    timing = json.loads((out / "timing.json").read_text())
+                    timing = json.loads((out / io.TIMING_FILE).read_text())
                     pairs = len(timing)
     median = {way: statistics.median(taken) for way, taken in seconds.items()}
     one, several = (way for way in ways if "worker" in way)

@@ -20,11 +20,11 @@ import threading
 import time
 from pathlib import Path
 
-from lidarflow import runner
+from lidarflow import io, runner
 from lidarflow.config import SolverConfig, load
 from lidarflow.datasets import open_dataset
 
-TIMED = ("timing.json", "recording.rrd")     # hold times, and ids that are drawn anew
+TIMED = (io.TIMING_FILE, io.RECORDING_FILE)  # hold times, and ids that are drawn anew
 WARM_UP_ROUNDS = 2                           # compilers and memory pools have settled after these
 MOST_HELD_MIB = 4                            # that what is held may grow
 MOST_GROWTH = 0.15                           # of what is resident: what allocators keep goes up and down
@@ -97,9 +97,10 @@ def growth(rounds):
         grew.append(f"memory held from {before_mib:.1f} to {after_mib:.1f} MiB")
     resident = [row[2] for row in rounds[WARM_UP_ROUNDS:]]
     half = len(resident) // 2
-    first_mib, last_mib = (statistics.median(part or [0.0]) for part in (resident[:half], resident[half:]))
-    if half and last_mib > (1.0 + MOST_GROWTH) * first_mib:
-        grew.append(f"resident memory from {first_mib:.0f} to {last_mib:.0f} MiB")
+    if half:
+        first_mib, last_mib = statistics.median(resident[:half]), statistics.median(resident[half:])
+        if last_mib > (1.0 + MOST_GROWTH) * first_mib:
+            grew.append(f"resident memory from {first_mib:.0f} to {last_mib:.0f} MiB")
     if more_threads > threads:
         grew.append(f"threads from {threads} to {more_threads}")
     if more_files > files:

@@ -1,11 +1,10 @@
 """`lidarflow run` in a process of its own, killed at a chosen moment."""
 
-import os
 import signal
 import subprocess
 import sys
 
-from shared_data import ROOT
+from shared_data import with_paths
 
 # Counts the calls of a function by its dotted name and dies like `kill -9` before, or in the middle of, one.
 _DRIVER = """
@@ -39,9 +38,8 @@ cli.main()
 def program(words, place="", number=0, how="before", **more):
     """`lidarflow WORDS` in a process of its own, which dies at the `number`th call of `place`."""
     code = _DRIVER.format(place=place, number=number, how=how, words=[str(word) for word in words])
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600,
-                          env={**os.environ, "PYTHONPATH": paths}, check=False, **more)
+                          env=with_paths(), check=False, **more)
 
 
 def was_killed(done):

@@ -1,10 +1,8 @@
 """The fast solver: its energy, gradient and normal equations, and how well it agrees with gtsam's."""
 
-import os
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -12,7 +10,7 @@ import pytest
 import worlds
 from energies import energy
 from numpy.testing import assert_allclose
-from shared_data import SHARED, needs_shared
+from shared_data import ROOT, SHARED, needs_shared, with_paths
 
 from lidarflow import config as settings
 from lidarflow import pipeline, pose
@@ -199,11 +197,9 @@ print(digest.hexdigest())
 
 def answer(threads: int, **environment: str) -> str:
     """Digest of what a process of its own finds with so many threads."""
-    here = Path(__file__).resolve().parent
-    path = os.pathsep.join([str(here), str(here.parent), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "-c", ANSWER], check=True, capture_output=True, text=True,
-        env={**os.environ, "NUMBA_NUM_THREADS": str(threads), "PYTHONPATH": path, **environment})
+        env={**with_paths(ROOT / "tests"), "NUMBA_NUM_THREADS": str(threads), **environment})
     return done.stdout
 
 

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 from cloud_files import message
-from shared_data import ROOT
+from shared_data import ROOT, with_paths
 
 from lidarflow import io
 from lidarflow.datasets import argoverse2_map
@@ -19,10 +19,9 @@ from lidarflow.datasets.clouds import load_arrays, read_points
 
 def fuzzed(count, seed, folder):
     """What `count` mutated files came to: the last line, and the lines on files that went wrong."""
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, str(ROOT / "tests" / "fuzzing.py"), str(count), str(seed), str(folder)],
-        capture_output=True, text=True, timeout=1800, env={**os.environ, "PYTHONPATH": paths}, check=False)
+        capture_output=True, text=True, timeout=1800, env=with_paths(ROOT / "tests"), check=False)
     left = [file.name for file in folder.glob("now_*")]
     assert done.returncode == 0 and not left, f"died at {left}: {done.stderr[-2000:]}"
     *wrong, summary = map(json.loads, done.stdout.splitlines())

@@ -1,22 +1,20 @@
 """The scripts behind RESULTS.md still run, and print figures of the size that they should have."""
 
-import os
 import re
 import subprocess
 import sys
 
 import pytest
-from shared_data import ROOT
+from shared_data import ROOT, with_paths
 
 pytestmark = pytest.mark.slow
 
 
 def printed(script, *words):
     """What a script prints; it must end well."""
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, str(ROOT / "scripts" / f"{script}.py"), *map(str, words)], capture_output=True,
-        text=True, timeout=600, cwd=ROOT, env={**os.environ, "PYTHONPATH": paths}, check=False)
+        text=True, timeout=600, cwd=ROOT, env=with_paths(), check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 

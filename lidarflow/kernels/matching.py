@@ -53,7 +53,7 @@ def _best_in_gate(
     best_sq, rival_sq = np.full(n, np.inf), np.full(n, np.inf)
     for couple in numba.prange((n + 1) // 2):
         a, b = by_place[2 * couple], by_place[min(2 * couple + 1, n - 1)]
-        near = _near_either(centres[a], centres[b], candidates, keys, lower, shape, gate_m)
+        near, inside = _near_either(centres[a], centres[b], candidates, keys, lower, shape, gate_m)
         products = np.empty((2, len(near)), np.float32)
         for k in range(0, len(near), 2):
             last = min(k + 1, len(near) - 1)
@@ -63,38 +63,39 @@ def _best_in_gate(
         for slot in range(2):
             i = b if slot else a
             best[i], best_sq[i], rival_sq[i] = _best_and_rival(
-                centres[i], candidates, near, products[slot], gate_m, rival_radius_m)
+                candidates, near, inside[slot], products[slot], rival_radius_m)
     return best, best_sq, rival_sq
 
 
 @njit()
 def _near_either(a, b, candidates, keys, lower, shape, gate_m):
-    """The candidates (n,) within the gate around a or around b, (3,) each."""
+    """The candidates (n,) within the gate around a or around b, (3,) each, and which are in whose (2, n)."""
     starts, ends = np.empty(18, np.int64), np.empty(18, np.int64)
     cell_a, cell_b = grid.cell_of(a, lower, gate_m), grid.cell_of(b, lower, gate_m)
     of_a = count = grid.runs_around(cell_a, keys, shape, starts, ends)
     if cell_b != cell_a:
         count += grid.runs_around(cell_b, keys, shape, starts[of_a:], ends[of_a:])
-    near, found = np.empty(grid.room(starts, ends, count), np.int64), 0
+    room = grid.room(starts, ends, count)
+    near, inside, found = np.empty(room, np.int64), np.empty((2, room), np.bool_), 0
     gate_sq = gate_m * gate_m
     for run in range(count):
         for j in range(starts[run], ends[run]):
             near_a = _distance_sq(a, candidates[j]) <= gate_sq
             near_b = _distance_sq(b, candidates[j]) <= gate_sq
-            # What is near to a has been found by the runs of a.
-            if near_b and not near_a if run >= of_a else near_a or (near_b and cell_a == cell_b):
-                near[found] = j
+            by_b = run >= of_a or cell_a == cell_b  # these runs are those of b
+            if (near_a and run < of_a) or (near_b and by_b and not near_a):
+                near[found], inside[0, found], inside[1, found] = j, near_a, near_b
                 found += 1
-    return near[:found]
+    return near[:found], inside[:, :found]
 
 
 @njit()
-def _best_and_rival(centre, candidates, near, products, gate_m, rival_radius_m):
-    """The best candidate, -1 for none, and the squared distances of it and of its rival."""
+def _best_and_rival(candidates, near, inside, products, rival_radius_m):
+    """The best of the candidates `inside`, -1 for none, and the squared distances of it and of its rival."""
     best, best_sq, rival_sq = -1, np.inf, np.inf
     distance_sq = np.full(len(near), np.inf)
     for k in range(len(near)):
-        if _distance_sq(centre, candidates[near[k]]) <= gate_m * gate_m:
+        if inside[k]:
             distance_sq[k] = max(0.0, 2.0 - 2.0 * products[k])
             if distance_sq[k] < best_sq:
                 best_sq, best = distance_sq[k], near[k]

@@ -60,9 +60,10 @@ def triangles(
 def _arranged(points: np.ndarray, normals: np.ndarray, max_edge_m: float) -> tuple[np.ndarray, Cloud]:
     """The order (N,) that points are walked through in, that of the finest grid, and them in it."""
     reaches_m = max_edge_m / 2.0 ** np.arange(_REACHES)[::-1]
-    order, *_ = grid.build(points, reaches_m[0])
+    order, *finest = grid.build(points, reaches_m[0])
     points = points[order]
-    grids = zip(*(grid.build(points, reach_m) for reach_m in reaches_m), strict=True)
+    coarser = (grid.build(points, reach_m) for reach_m in reaches_m[1:])
+    grids = zip((np.arange(len(points)), *finest), *coarser, strict=True)
     return order, Cloud(
         points, normals[order], np.linalg.norm(points, axis=1), reaches_m, *map(np.stack, grids))
 
@@ -190,17 +191,21 @@ def _delaunay_ring(plane):
         if after == first:
             break
         here = after
-    return hull[:size], _largest_circle(image, hull[:size], after == first)
+    hull = hull[:size]
+    return hull, _largest_circle(image, hull) if after == first else math.inf
 
 
 @njit()
-def _largest_circle(image, hull, is_closed):
-    """Diameter of the largest circle through the origin that is the inverse of a side of the hull."""
+def _largest_circle(image, hull):
+    """Diameter of the largest circle through the origin that is the inverse of a side of the closed hull.
+
+    Infinite where the origin is not within it.
+    """
     diameter = 0.0
     for s in range(len(hull)):
         a, b = image[hull[s]], image[hull[(s + 1) % len(hull)]]
         cross = a[0] * b[1] - a[1] * b[0]
-        if not is_closed or cross <= 0.0:
+        if cross <= 0.0:
             return math.inf
         diameter = max(diameter, math.hypot(b[0] - a[0], b[1] - a[1]) / cross)
     return diameter
