@@ -42,24 +42,25 @@ class Aside:
     def __init__(self) -> None:
         self._lent = contextlib.ExitStack()
         self._thread: ThreadPoolExecutor | None = None
-        self._begun: list[Future] = []
+        self._last: Future | None = None
 
     def __enter__(self) -> "Aside":
         if numba.get_num_threads() > 1:
             self._thread = self._lent.enter_context(_borrowed())
-            self._lent.callback(wait, self._begun)
         return self
 
     def __exit__(self, *_error: object) -> None:
+        if self._last is not None:
+            wait([self._last])
         self._lent.close()
-        self._thread = None     # another may have it by now
+        self._thread = self._last = None     # another may have the thread by now
 
     def begin(self, function: Callable[P, T], *given: P.args, **named: P.kwargs) -> "Future[T]":
         """Begin a call; result() of what is returned waits for it, and raises what it raised."""
         if self._thread is None:
             return done(function, *given, **named)
-        self._begun.append(self._thread.submit(function, *given, **named))
-        return self._begun[-1]
+        begun = self._last = self._thread.submit(function, *given, **named)
+        return begun
 
 
 def done(function: Callable[P, T], *given: P.args, **named: P.kwargs) -> "Future[T]":
@@ -74,21 +75,24 @@ def there(value: T) -> "Future[T]":
     return known
 
 
-def ahead(items: Iterator[T]) -> Iterator[T]:
-    """`items`, the next of which is made while whoever asks uses the last.
+@contextlib.contextmanager
+def ahead(items: Iterator[T]) -> Iterator[Iterator[T]]:
+    """`items`, the next of which is made while whoever asks uses the last; leaving waits for it.
 
     What making one raises is raised where it would have come. With one thread for kernels nothing is made
     before it is asked for.
     """
     if numba.get_num_threads() == 1:
-        yield from items
+        yield items
         return
+    with Aside() as beside:
+        yield _one_ahead(items, beside)
+
+
+def _one_ahead(items: Iterator[T], beside: Aside) -> Iterator[T]:
+    # Nothing is waited for at the end: a generator may be thrown away by any thread, by its own as well.
     end = object()
-    with _borrowed() as thread:
-        begun = thread.submit(next, items, end)
-        try:
-            while (item := begun.result()) is not end:
-                begun = thread.submit(next, items, end)
-                yield item  # type: ignore[misc]
-        finally:
-            wait([begun])     # before another has the thread
+    begun = beside.begin(next, items, end)
+    while (item := begun.result()) is not end:
+        begun = beside.begin(next, items, end)
+        yield item  # type: ignore[misc]

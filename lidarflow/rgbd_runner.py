@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow import io, metrics, pose, rgbd_io, rgbd_methods, rgbd_metrics, rgbd_preview
+from lidarflow.aside import ahead
 from lidarflow.datasets.rgbd_folders import RgbdFolder
 from lidarflow.resuming import Plan
 from lidarflow.rgbd_checkpoints import RgbdCheckpoints
@@ -63,8 +64,8 @@ def process(
     walk = Walk.of_frames(folder, rgbd_methods.estimator(method, folder.camera, config))
     done, skipped = begun_steps(walk, plan, kept, out, going)
     reports, way = [], Trajectory(frames)
-    with recording(out / io.RECORDING_FILE, viewing, _open_recording) as stream:
-        for step in done:
+    with recording(out / io.RECORDING_FILE, viewing, _open_recording) as stream, ahead(done) as computed:
+        for step in computed:
             reports.append(_write_pair(folder, step, plan, out, stream, way))
             if not step.restored:
                 kept.save(step.index, step.pair, step.result)

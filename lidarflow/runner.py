@@ -112,8 +112,8 @@ def process(
     walk = Walk.of_scans(dataset, methods.find(method).along(config))
     done, skipped = begun_steps(walk, plan, kept, out, going)
     reports, way, objects = [], Trajectory(frames), []
-    with recording(out / io.RECORDING_FILE, viewing, _open_recording) as stream:
-        for step in done:
+    with recording(out / io.RECORDING_FILE, viewing, _open_recording) as stream, ahead(done) as computed:
+        for step in computed:
             reports.append(_write_pair(dataset, step, config, out, stream, way, viewing.arrows))
             if not step.restored:
                 kept.save(step.index, step.pair, step.result, step.tracks)
@@ -137,9 +137,9 @@ def begun_steps(walk: Walk, plan: Plan, kept: Kept, out: Path, going: Going
                 ) -> tuple[Iterator[Step], list[Skipped]]:
     """The pairs of a run, whose folder `out` is ready for results, and the scans that are left out.
 
-    Those come to the list as the pairs are gone through. The next pair is read and computed while one is
-    written. The first pair is done before the folder is touched: bad data leave no empty run behind. Raises
-    LidarflowError where nothing can be used or `out` holds another run.
+    Those come to the list as the pairs are gone through. The first pair is done before the folder is touched:
+    bad data leave no empty run behind. Raises LidarflowError where nothing can be used or `out` holds another
+    run.
     """
     skipped: list[Skipped] = []
 
@@ -159,7 +159,7 @@ def begun_steps(walk: Walk, plan: Plan, kept: Kept, out: Path, going: Going
         io.remove_left_overs(out)
     else:
         resuming.begin(out, plan)
-    return ahead(itertools.chain([first], done)), skipped
+    return itertools.chain([first], done), skipped
 
 
 def finish(

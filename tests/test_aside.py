@@ -65,8 +65,8 @@ def failing_after(count: int, made: list[int]):
 @needs_two_threads
 def test_the_next_item_is_made_while_the_last_is_used():
     made, used = [], []
-    with pytest.raises(ValueError, match="no more"):
-        for item in ahead(failing_after(4, made)):
+    with pytest.raises(ValueError, match="no more"), ahead(failing_after(4, made)) as items:
+        for item in items:
             for _ in range(200):
                 if len(made) > min(item + 1, 3):
                     break
@@ -74,15 +74,17 @@ def test_the_next_item_is_made_while_the_last_is_used():
             assert made == list(range(min(item + 2, 4)))
             used.append(item)
     assert used == [0, 1, 2, 3]
-    assert list(ahead(iter("abc"))) == ["a", "b", "c"]
+    with ahead(iter("abc")) as items:
+        assert list(items) == ["a", "b", "c"]
 
 
 def test_items_are_made_one_by_one_where_kernels_have_one_thread():
     made, before = [], numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        assert next(ahead(failing_after(4, made))) == 0
-        assert made == [0]
+        with ahead(failing_after(4, made)) as items:
+            assert next(items) == 0
+            assert made == [0]
     finally:
         numba.set_num_threads(before)
 
@@ -100,9 +102,9 @@ def test_whoever_stops_early_leaves_a_thread_that_the_next_one_uses():
         used.add(beside.begin(threading.get_ident).result())
     begun = threading.active_count()
     for _ in range(5):
-        items = ahead(idents())
-        used.add(next(items))
-        items.close()
+        with pytest.raises(ValueError, match="the disk is full"), ahead(idents()) as items:
+            used.add(next(items))
+            raise ValueError("the disk is full")
         so_far = len(made)
         time.sleep(0.01)
         assert len(made) == so_far
