@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -23,13 +24,12 @@ from lidarflow.lidar import (
 )
 from lidarflow.lidar import uncertainty as uncertainties
 from lidarflow.lidar.attribution import WORLD, Attribution, Search
+from lidarflow.lidar.matching import Matches
 from lidarflow.lidar.mesh import Mesh
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.solve import solve
 from lidarflow.stopwatch import Stopwatch
 from lidarflow.types import FlowResult, Scan, ScanPair, as_scan
-
-_MATCHED_NEAR_M = 1.5   # of the seeds of objects; a car's other end is farther, but has seeds of its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,10 +142,10 @@ def run(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """A pair up to the question what moves: features, ego-motion, meshes, and the graph with its matches.
+    """A pair up to the question what moves: features, ego-motion, meshes, and the graph.
 
     `tracks` are what earlier pairs lead to expect; `search`, where to look for objects, is None when they are
-    not looked for.
+    not looked for. The graph then has its matches, else none yet, and `matches` finds them.
     """
 
     pair: ScanPair
@@ -157,6 +157,7 @@ class Prepared:
     tracks: Tracks
     search: Search | None
     graph: frontend.Graph
+    matches: Matches
     seconds: dict[str, float]
 
 
@@ -196,15 +197,19 @@ def prepare(
             keypoints = source.keypoints, target.keypoints
         with timed("mesh"):
             source_mesh = begun_mesh.result()
-        with timed("matching"):
-            # Where nothing may have moved, matches would say what ego-motion says already.
-            sought = search.near(_MATCHED_NEAR_M) if search else np.ones(len(points), bool)
-            start_motions = _start(points, sought, previous, ego_motion, config)
-            graph = frontend.build_problem(pair, *keypoints, source_mesh, start_motions, config, sought)
+        with timed("graph"):
+            start_at = partial(_start, previous=previous, ego_motion=ego_motion, config=config)
+            start_motions = start_at(points) if search is None else _tiled(ego_motion, len(points))
+            graph = frontend.build(points, source_mesh, start_motions, config.graph.thinning_m)
+            matches = frontend.matches(graph, *keypoints, start_at, pair.dt_s, config.matching)
+        if search is None:
+            with timed("matching"):
+                graph = frontend.matched(graph, *matches.of(graph.rows))
         with timed("mesh"):
             target_mesh = begun_target_mesh.result() if begun_target_mesh else None
     return Prepared(
-        pair, source, target, ego_motion, source_mesh, target_mesh, tracks, search, graph, timed.seconds)
+        pair, source, target, ego_motion, source_mesh, target_mesh, tracks, search, graph, matches,
+        timed.seconds)
 
 
 def _mesh(scan: Scan, seen: features.Features, config: Config) -> Mesh:
@@ -216,14 +221,15 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
     pair, source, graph, ego_motion = prepared.pair, prepared.source, prepared.graph, prepared.ego_motion
     timed = Stopwatch(dict(prepared.seconds))
     points = pair.source.points
-    matches = graph.problem.points[graph.problem.match_index], graph.problem.match_target
     with timed("objects"):
         found = Attribution.none(len(points))
         if prepared.search:
-            matched = graph.rows[graph.problem.match_index], graph.problem.match_target
             found = attribution.attribute(
-                pair, prepared.search, matched, ego_motion, prepared.tracks, config)
+                pair, prepared.search, prepared.matches, ego_motion, prepared.tracks, config)
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
+            # Around objects, matches would say what ego-motion says already.
+            moving = np.flatnonzero(found.owner != WORLD)
+            graph = frontend.matched(graph, *prepared.matches.of(moving[frontend.sit_here(graph, moving)]))
         by_group = np.concatenate([found.motions, ego_motion[None]])[found.owner]   # WORLD is the last
     with timed("solver"):
         motions, solved, stats = solve(graph.problem, config.solver, config.graph.min_matches)
@@ -241,6 +247,7 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
             is_dynamic = dynamic.detect(
                 points, residual_flow, is_solved, prepared.mesh.edges, ego_motion,
                 pair.target.points[prepared.target.usable], pair.dt_s, config.dynamic)
+        matches = graph.problem.points[graph.problem.match_index], graph.problem.match_target
         valid = source.ground | found.explained | is_solved
         object_id = np.append(found.ids, np.int32(-1))[found.owner]
         std_m = _std(points, found, graph, motions, solved, in_graph, flow, by_group, config)
@@ -302,8 +309,12 @@ def _std(
 
 
 def _start(
-    points: np.ndarray, wanted: np.ndarray, previous: Previous | None, ego_motion: np.ndarray, config: Config
+    points: np.ndarray, previous: Previous | None, ego_motion: np.ndarray, config: Config
 ) -> np.ndarray:
     if previous is None or config.graph.start == "ego":
-        return np.tile(ego_motion, (len(points), 1, 1))
-    return start.carried(points, wanted, previous.points, previous.result, ego_motion)
+        return _tiled(ego_motion, len(points))
+    return start.carried(points, previous.points, previous.result, ego_motion)
+
+
+def _tiled(motion: np.ndarray, count: int) -> np.ndarray:
+    return np.broadcast_to(motion, (count, 4, 4))

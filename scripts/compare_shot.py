@@ -61,10 +61,10 @@ def main() -> None:
     print(f"{len(points)} points, {len(keypoints)} keypoints, radius {radius_m} m, {options.threads} threads")
 
     ours_s, pcl_s = [], []
-    shot.describe(points[keypoints[:10]], points, point_normals, radius_m, 5)   # compile
+    shot.describe(points[keypoints[:10]], shot.support(points, point_normals, radius_m), 5)   # compile
     for _ in range(options.repeat):
         begin = time.perf_counter()
-        ours, _ = shot.describe(points[keypoints], points, point_normals, radius_m, 5)
+        ours, _ = shot.describe(points[keypoints], shot.support(points, point_normals, radius_m), 5)
         ours_s.append(time.perf_counter() - begin)
         theirs, seconds = pcl_descriptors(
             options.pcl, points, point_normals, keypoints, radius_m, options.threads)

@@ -34,9 +34,11 @@ def evaluate_pair(dataset, index: int, config: settings.Config) -> str:
     kept = source.standing
     found = mesh.build(points, kept, source.surface, config.mesh, config.normals.radius_m)
     # The gate is centred on the point itself: nothing is known of the motion beforehand.
-    graph = frontend.build_problem(
-        pair, source.keypoints, target.keypoints, found, pose.identity(len(points)), config,
-        np.ones(len(points), bool)).problem
+    graph = frontend.build(points, found, pose.identity(len(points)), config.graph.thinning_m)
+    matches = frontend.matches(
+        graph, source.keypoints, target.keypoints, lambda at: pose.identity(len(at)), pair.dt_s,
+        config.matching)
+    graph = frontend.matched(graph, *matches.of(graph.rows)).problem
     row = [f"{dataset.name} {pair.source.name}", found.method,
            f"{meshed_share(points, kept, found.component):.3f}", str(len(graph.match_index))]
     truth, _ = runner.find_truth(dataset, index, pair)

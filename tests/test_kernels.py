@@ -248,7 +248,7 @@ def described_surface(count: int, keypoints: int):
 
 def check_shot(count: int, keypoints: int) -> None:
     chosen, surface, surface_normals = described_surface(count, keypoints)
-    descriptors, frames = shot.describe(chosen, surface, surface_normals, RADIUS_M, 5)
+    descriptors, frames = shot.describe(chosen, shot.support(surface, surface_normals, RADIUS_M), 5)
     compared = 0
     for row, keypoint in enumerate(chosen):
         expected, frame, is_certain = shot_twin(keypoint, surface, surface_normals, RADIUS_M)
@@ -261,7 +261,9 @@ def check_shot(count: int, keypoints: int) -> None:
 
 # ---- matching -------------------------------------------------------------------------------------------
 
-def matching_twin(centres, descriptors, candidates, candidate_descriptors, gate_m, rival_radius_m):
+def matching_twin(queries, among, gate_m, rival_radius_m):
+    centres, descriptors = queries.points, queries.table[queries.row]
+    candidates, candidate_descriptors = among.points, among.table[among.row]
     best = np.full(len(centres), -1)
     best_sq, rival_sq = np.full(len(centres), np.inf), np.full(len(centres), np.inf)
     for i, centre in enumerate(centres):
@@ -281,13 +283,15 @@ def check_matching(count: int) -> None:
     centres[0] = (40.0, 0, 0)
     unit = [d / np.linalg.norm(d, axis=1, keepdims=True) for d in random.uniform(size=(2, count, 20))]
     unit = [d.astype(np.float32) for d in unit]
-    given = (centres, unit[0][: len(centres)], candidates, unit[1], 1.1, 0.6)
+    row, candidate_row = random.integers(0, count, len(centres)), random.permutation(count)
+    queries = matching.Described(centres, row, unit[0])
+    given = (queries, matching.Described(candidates, candidate_row, unit[1]), 1.1, 0.6)
     found, expected = matching.best_in_gate(*given), matching_twin(*given)
     assert (expected[0] == -1).any() and (expected[0] >= 0).any() and np.isfinite(expected[2]).any()
     np.testing.assert_array_equal(found[0], expected[0])
     np.testing.assert_allclose(found[1], expected[1], atol=1e-5)
     np.testing.assert_allclose(found[2], expected[2], atol=1e-5)
-    nothing = matching.best_in_gate(centres, given[1], candidates[:0], unit[1][:0], 1.1, 0.6)
+    nothing = matching.best_in_gate(queries, matching.Described.whole(candidates[:0], unit[1]), 1.1, 0.6)
     assert (nothing[0] == -1).all() and np.isinf(nothing[1]).all() and np.isinf(nothing[2]).all()
 
 
@@ -439,7 +443,7 @@ def test_shot():
 def test_shot_has_unit_norm_or_is_nan():
     chosen, surface, surface_normals = described_surface(1500, 20)
     far = np.vstack([chosen, [[40.0, 0, 0]], surface[:1] + [0, 50, 0]])
-    descriptors, frames = shot.describe(far, surface, surface_normals, RADIUS_M, 10)
+    descriptors, frames = shot.describe(far, shot.support(surface, surface_normals, RADIUS_M), 10)
     assert descriptors.dtype == np.float32 and descriptors.shape == (22, 352)
     np.testing.assert_allclose(np.linalg.norm(descriptors[:20], axis=1), 1.0, atol=1e-5)
     assert np.isnan(descriptors[20:]).all() and np.isnan(frames[20:]).all()
@@ -447,16 +451,17 @@ def test_shot_has_unit_norm_or_is_nan():
                                atol=1e-9)
     np.testing.assert_allclose(np.linalg.det(frames[:20]), 1.0)
     counts = (np.linalg.norm(surface - chosen[:, None], axis=2) <= RADIUS_M).sum(axis=1)
-    nothing, _ = shot.describe(chosen, surface, surface_normals, RADIUS_M, int(counts.max()) + 1)
+    around = shot.support(surface, surface_normals, RADIUS_M)
+    nothing, _ = shot.describe(chosen, around, int(counts.max()) + 1)
     assert np.isnan(nothing).all()
 
 
 def test_shot_turns_with_the_cloud():
     chosen, surface, surface_normals = described_surface(1500, 40)
     rotation, shift = random_rotation(rng(8)), np.array([3.0, -7.0, 1.0])
-    there, frames = shot.describe(chosen, surface, surface_normals, RADIUS_M, 10)
-    turned, turned_frames = shot.describe(
-        chosen @ rotation.T + shift, surface @ rotation.T + shift, surface_normals @ rotation.T, RADIUS_M, 10)
+    there, frames = shot.describe(chosen, shot.support(surface, surface_normals, RADIUS_M), 10)
+    around = shot.support(surface @ rotation.T + shift, surface_normals @ rotation.T, RADIUS_M)
+    turned, turned_frames = shot.describe(chosen @ rotation.T + shift, around, 10)
     cosine = (there.astype(float) * turned).sum(axis=1)
     assert cosine.min() >= 0.999
     np.testing.assert_allclose(turned_frames, frames @ rotation.T, atol=1e-6)
@@ -519,7 +524,7 @@ def test_kernels_leave_their_arguments_alone(seed):
     before = points.copy()
     own = normals.estimate(points, points, 0.5)
     own_before = own.copy()
-    shot.describe(points[:10], points, own, RADIUS_M, 10)
+    shot.describe(points[:10], shot.support(points, own, RADIUS_M), 10)
     grid.first_per_voxel(points, 0.3)
     np.testing.assert_array_equal(points, before)
     np.testing.assert_array_equal(own, own_before)

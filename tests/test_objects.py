@@ -179,7 +179,11 @@ def test_planes_are_not_carried_along_by_rings():
 
 
 def look(source: Cloud, target: Cloud, matched: np.ndarray, moved: np.ndarray) -> view_of_pair.View:
-    return view_of_pair.look(source, target, CONFIG).with_matches(matched, moved)
+    def matches(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        asked = np.isin(matched, rows)
+        return matched[asked], moved[asked]
+
+    return replace(view_of_pair.look(source, target, CONFIG), matches=matches)
 
 
 def scene(car_shift: np.ndarray, seed: int, wall_shift: np.ndarray = (0.0, 0.0, 0.0)) -> view_of_pair.View:

@@ -97,7 +97,7 @@ def test_matches_and_stats_are_those_of_the_graph(car):
     assert all(row.tobytes() in target for row in result.match_target)
     assert stats.plain_final_error < stats.plain_initial_error
     assert stats.robust_final_error <= stats.robust_initial_error
-    stages = {"features", "ego-motion", "mesh", "matching", "objects", "solver", "refinement",
+    stages = {"features", "ego-motion", "mesh", "graph", "matching", "objects", "solver", "refinement",
               "dense answer"}
     assert stages == set(result.seconds)
 
@@ -177,23 +177,19 @@ def drive():
 
 def _estimated(scans: list[Scan], registered: list[np.ndarray] | None = None):
     """Results and start values of a run over `scans`; `registered` replaces the results of registration."""
-    starts, build_problem = [], frontend.build_problem
+    starts, build = [], frontend.build
 
-    def recorded(pair, source, target, mesh, start_motions, config, sought):
+    def recorded(points, mesh, start_motions, thinning_m):
         starts.append(start_motions)
-        return build_problem(pair, source, target, mesh, start_motions, config, sought)
+        return build(points, mesh, start_motions, thinning_m)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frontend, "build_problem", recorded)
+        patch.setattr(frontend, "build", recorded)
         if registered is not None:
             given = iter(registered)
             patch.setattr(ego, "register", lambda *args: next(given))
         estimator = FlowEstimator(GRAPH_ALONE)
         return [estimator.step(scan) for scan in scans], starts
-
-
-def everywhere(points: np.ndarray) -> np.ndarray:
-    return np.ones(len(points), bool)
 
 
 def test_motions_are_carried_to_where_their_points_went(drive):
@@ -202,18 +198,14 @@ def test_motions_are_carried_to_where_their_points_went(drive):
     assert results[0] is None
     assert (starts[0] == first.ego_motion).all()
     moved, known = scans[0].points + first.flow, first.in_graph & first.valid
-    carried = start.carried(moved, everywhere(moved), scans[0].points, first, second.ego_motion)
+    carried = start.carried(moved, scans[0].points, first, second.ego_motion)
     assert moved[known].shape == np.unique(moved[known], axis=0).shape   # so that the nearest is itself
     assert (carried[known] == first.motions[known]).all()
     far_away = start.carried(
-        moved[known] + [0.0, 0.0, 50.0], everywhere(moved[known]), scans[0].points, first, second.ego_motion)
+        moved[known] + [0.0, 0.0, 50.0], scans[0].points, first, second.ego_motion)
     assert (far_away == second.ego_motion).all()
-    again = start.carried(
-        scans[1].points, everywhere(scans[1].points), scans[0].points, first, second.ego_motion)
+    again = start.carried(scans[1].points, scans[0].points, first, second.ego_motion)
     assert (starts[1] == again).all()
-    wanted = np.arange(len(moved)) % 2 == 0
-    sparing = start.carried(moved, wanted, scans[0].points, first, second.ego_motion)
-    assert (sparing[wanted] == carried[wanted]).all() and (sparing[~wanted] == second.ego_motion).all()
     on_car = moves[1] & second.in_graph & second.valid
     begun_m = np.linalg.norm(pose.apply(starts[1][on_car], scans[1].points[on_car])
                              - scans[1].points[on_car] - second.flow[on_car], axis=1)

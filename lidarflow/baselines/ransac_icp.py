@@ -49,9 +49,9 @@ class RansacIcp(WholeScan):
         """Matched keypoints (K, 3) of the source and (K, 3) of the target, gates around unmoved points."""
         config = self.config.matching
         gate = max(config.max_speed_m_per_s, _MIN_GATE_M_PER_S)
-        here, there = source.keypoints, target.keypoints
-        from_points, to_points = pair.source.points[here.row], pair.target.points[there.row]
-        query, found = matching.match(
-            from_points, here.descriptors, to_points, there.descriptors, pair.dt_s,
+        here = source.keypoints
+        matches = matching.Matches(
+            here, np.arange(len(here.row)), here.points, target.keypoints, pair.dt_s,
             replace(config, max_speed_m_per_s=gate))
-        return from_points[query], to_points[found]
+        rows, places = matches.of(here.row)
+        return pair.source.points[rows], places

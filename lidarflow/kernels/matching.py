@@ -1,5 +1,7 @@
 """Best and second-best descriptors among the candidates inside a gate."""
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
@@ -9,22 +11,36 @@ from lidarflow.kernels.compiled import njit
 _PLACES = 4     # of queries that are looked at together, along each side of a gate
 
 
-def best_in_gate(
-    centres: np.ndarray, descriptors: np.ndarray, candidates: np.ndarray,
-    candidate_descriptors: np.ndarray, gate_m: float, rival_radius_m: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For every query, the most similar candidate within the gate and its best rival elsewhere.
+class Described(NamedTuple):
+    """Points (K, 3), metres, and the row (K,) of a table (T, D) float32 that has each one's descriptor."""
 
-    centres (Q, 3) of the gates, descriptors (Q, D) float32 of unit norm, candidates (C, 3) and their
-    descriptors (C, D). Returns best (Q,) int64, -1 for an empty gate, and squared descriptor distances
-    (Q,) of the best and of the best candidate farther than `rival_radius_m` from it (inf without one).
+    points: np.ndarray
+    row: np.ndarray
+    table: np.ndarray
+
+    @classmethod
+    def whole(cls, points: np.ndarray, table: np.ndarray) -> "Described":
+        """Points (K, 3) with descriptors (K, D) in the same order."""
+        return cls(points, np.arange(len(points)), table)
+
+    def part(self, kept: np.ndarray) -> "Described":
+        """Some of them (P,)."""
+        return Described(self.points[kept], self.row[kept], self.table)
+
+
+def best_in_gate(
+    queries: Described, candidates: Described, gate_m: float, rival_radius_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For every query, the most similar candidate within the gate around it and its best rival elsewhere.
+
+    Returns best (Q,) int64, -1 for an empty gate, and squared descriptor distances (Q,) of the best and of
+    the best candidate farther than `rival_radius_m` from it (inf without one).
     """
-    order, keys, lower, shape = grid.build(candidates, gate_m)
+    order, keys, lower, shape = grid.build(candidates.points, gate_m)
     # Two queries of one place share their candidates: what is read for one serves the other.
-    by_place, *_ = grid.build(centres, gate_m / _PLACES)
+    by_place, *_ = grid.build(queries.points, gate_m / _PLACES)
     best, best_sq, rival_sq = _best_in_gate(
-        centres, descriptors, by_place, candidates[order], candidate_descriptors, order, keys, lower, shape,
-        gate_m, rival_radius_m)
+        queries, by_place, candidates.part(order), keys, lower, shape, gate_m, rival_radius_m)
     found = best >= 0
     best[found] = order[best[found]]
     return best, best_sq, rival_sq
@@ -44,26 +60,23 @@ def _products(a, b, c, d):
 
 
 @njit(parallel=True)
-def _best_in_gate(
-    centres, descriptors, by_place, candidates, candidate_descriptors, order, keys, lower, shape, gate_m,
-    rival_radius_m
-):
-    n = len(centres)
+def _best_in_gate(queries, by_place, candidates, keys, lower, shape, gate_m, rival_radius_m):
+    n, centres = len(queries.points), queries.points
     best = np.full(n, -1, np.int64)
     best_sq, rival_sq = np.full(n, np.inf), np.full(n, np.inf)
     for couple in numba.prange((n + 1) // 2):
         a, b = by_place[2 * couple], by_place[min(2 * couple + 1, n - 1)]
-        near, inside = _near_either(centres[a], centres[b], candidates, keys, lower, shape, gate_m)
+        near, inside = _near_either(centres[a], centres[b], candidates.points, keys, lower, shape, gate_m)
         products = np.empty((2, len(near)), np.float32)
         for k in range(0, len(near), 2):
             last = min(k + 1, len(near) - 1)
             products[0, k], products[0, last], products[1, k], products[1, last] = _products(
-                descriptors[a], descriptors[b], candidate_descriptors[order[near[k]]],
-                candidate_descriptors[order[near[last]]])
+                queries.table[queries.row[a]], queries.table[queries.row[b]],
+                candidates.table[candidates.row[near[k]]], candidates.table[candidates.row[near[last]]])
         for slot in range(2):
             i = b if slot else a
             best[i], best_sq[i], rival_sq[i] = _best_and_rival(
-                candidates, near, inside[slot], products[slot], rival_radius_m)
+                candidates.points, near, inside[slot], products[slot], rival_radius_m)
     return best, best_sq, rival_sq
 
 

@@ -8,6 +8,7 @@ branches run on several neighbours at once.
 """
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -24,18 +25,31 @@ _CHUNK = 64      # keypoints that one thread takes at a time
 _TINY = 1e-300
 
 
-def describe(
-    keypoints: np.ndarray, surface: np.ndarray, normals: np.ndarray, radius_m: float, min_neighbours: int
-) -> tuple[np.ndarray, np.ndarray]:
+class Support(NamedTuple):
+    """What descriptors see: points (S, 3) and normals (S, 3) of a surface, in the order of a grid."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    keys: np.ndarray
+    lower: np.ndarray
+    shape: np.ndarray
+    radius_m: float
+
+
+def support(surface: np.ndarray, normals: np.ndarray, radius_m: float) -> Support:
+    """The points (S, 3) of a surface and its normals (S, 3), to be seen within `radius_m` of keypoints."""
+    order, keys, lower, shape = grid.build(surface, radius_m)
+    return Support(surface[order], normals[order], keys, lower, shape, radius_m)
+
+
+def describe(keypoints: np.ndarray, seen: Support, min_neighbours: int) -> tuple[np.ndarray, np.ndarray]:
     """Descriptors (K, 352) float32 of unit norm and frames (K, 3, 3) with rows x, y, z.
 
-    keypoints (K, 3), surface (S, 3), normals (S, 3) of the surface; rows without enough neighbours are NaN.
+    Rows of the keypoints (K, 3) without enough neighbours are NaN.
     """
-    order, keys, lower, shape = grid.build(surface, radius_m)
     descriptors = np.full((len(keypoints), SIZE), np.nan, np.float32)
     frames = np.full((len(keypoints), 3, 3), np.nan)
-    _describe(keypoints, surface[order], normals[order], keys, lower, shape, radius_m, min_neighbours,
-              descriptors, frames)
+    _describe(keypoints, *seen, min_neighbours, descriptors, frames)
     return descriptors, frames
 
 

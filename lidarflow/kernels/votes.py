@@ -6,26 +6,6 @@ from lidarflow.kernels.compiled import njit
 
 
 @njit()
-def mode(shifts, radius_m):
-    """Mean (3,) of the shifts (K, 3) around the one that most others are within `radius_m` of."""
-    most, best = 0, 0
-    for i in range(len(shifts)):
-        count = 0
-        for j in range(len(shifts)):
-            count += _apart_sq(shifts, i, j) <= radius_m * radius_m
-        if count > most:
-            most, best = count, i
-    mean = np.zeros(3)
-    for j in range(len(shifts)):
-        if _apart_sq(shifts, best, j) <= radius_m * radius_m:
-            for k in range(3):
-                mean[k] += shifts[j, k]
-    for k in range(3):
-        mean[k] /= most
-    return mean
-
-
-@njit()
 def median(shifts):
     """Median (3,) of the shifts (K, 3) along each axis."""
     middle, half = np.empty(3), len(shifts) // 2

@@ -36,10 +36,10 @@ def moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
         _observability(view, body, shift) >= config.min_observability
         and min(_left_and_arrived(view, body, moved)) >= config.min_unexplained * _should_show(
             view, body, moved, shift, config)
-        and _matches_agree(view, body, shift, config)
         and _clearance(view, points) <= config.max_clearance_m
         and _shape_ratio(view, body, moved) <= config.max_shape_ratio
-        and not _surroundings_gain(view, body, shift))
+        and not _surroundings_gain(view, body, shift)
+        and _matches_agree(view, body, shift, config))
 
 
 def _clearance(view: View, points: np.ndarray) -> float:
@@ -92,13 +92,10 @@ def _observability(view: View, body: Body, shift: np.ndarray) -> float:
 
 def _matches_agree(view: View, body: Body, shift: np.ndarray, config: ObjectsConfig) -> bool:
     """Whether the body's median descriptor match is nearer to its motion than to rest, along the ground."""
-    is_body = np.zeros(len(view.points), bool)
-    is_body[body.rows] = True
-    on_body = is_body[view.match_rows]
-    if on_body.sum() < max(config.min_matches, 1):
+    rows, places = view.matches(body.rows)
+    if len(rows) < max(config.min_matches, 1):
         return config.min_matches == 0
-    points, match_shift = view.points[view.match_rows[on_body]], view.match_shift[on_body]
-    off = votes.median(points + match_shift - pose.apply(body.over_ground, points))
+    off = votes.median(places - pose.apply(body.over_ground, view.points[rows]))
     return np.hypot(off[0], off[1]) <= min(config.max_match_deviation * np.hypot(shift[0], shift[1]), CAP_M)
 
 

@@ -1,17 +1,18 @@
 """What every point of a pair moves with: the static world, or one of the moving objects."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import Config
-from lidarflow.kernels import neighbours, tree
+from lidarflow.kernels import tree
 from lidarflow.lidar import objects, seeds, tracking, uncertainty
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
 from lidarflow.lidar.features import Features
 from lidarflow.lidar.hypotheses import Expected
+from lidarflow.lidar.matching import Matches
 from lidarflow.lidar.seeds import Seeds
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.lidar.view import View
@@ -50,27 +51,18 @@ class Attribution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """Where in a pair to look for objects, before anything is matched.
+    """Where in a pair to look for objects.
 
-    count     int          points of the source
     rows      (U,) int64   those of them that the view has
-    view      View         without matches
+    view      View         before anything is matched
     expected  Expected     what earlier pairs lead to expect
     seeds     Seeds
     """
 
-    count: int
     rows: np.ndarray
     view: View
     expected: Expected
     seeds: Seeds
-
-    def near(self, reach_m: float) -> np.ndarray:
-        """Which points of the source stand nearer than `reach_m` to a cluster of seeds: (N,)."""
-        found, seeds_tree = np.zeros(self.count, bool), tree.build(self.view.points[self.seeds.clustered()])
-        found[self.rows] = neighbours.any_within(
-            seeds_tree, self.view.points, np.full(len(self.rows), reach_m))
-        return found
 
 
 def search(
@@ -82,19 +74,20 @@ def search(
     expected = _expected(tracks, ego_motion)
     found = seeds.find(view, expected.points, config.objects)
     rows = np.flatnonzero(source.standing)
-    return Search(len(source.usable), rows, view, expected, found)
+    return Search(rows, view, expected, found)
 
 
 def attribute(
-    pair: ScanPair, sought: Search, matches: tuple[np.ndarray, np.ndarray], ego_motion: np.ndarray,
-    tracks: Tracks, config: Config,
+    pair: ScanPair, sought: Search, matches: Matches, ego_motion: np.ndarray, tracks: Tracks, config: Config
 ) -> Attribution:
-    """Find the moving objects of a pair; matches are rows (K,) of the source and their places (K, 3).
-
-    `tracks` are those of the pair before, in the frame of the source.
-    """
+    """Find the moving objects of a pair; `tracks` are of the pair before, in the frame of the source."""
     points, rows = pair.source.points, sought.rows
-    view = sought.view.with_matches(np.searchsorted(rows, matches[0]), matches[1])
+
+    def of_view(asked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found, places = matches.of(rows[asked])
+        return np.searchsorted(rows, found), places
+
+    view = replace(sought.view, matches=of_view)
     bodies = objects.find(view, sought.seeds, pair.dt_s, config.objects, sought.expected)
 
     owner, explained = np.full(len(points), WORLD), np.zeros(len(points), bool)

@@ -1,4 +1,4 @@
-"""What one scan brings to any pair it is part of: masks, surface, keypoints, descriptors."""
+"""What one scan brings to any pair it is part of: masks, surface, keypoints."""
 
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -7,8 +7,9 @@ import numpy as np
 
 from lidarflow.aside import Aside, done
 from lidarflow.config import Config
-from lidarflow.kernels import grid, shot, tree
+from lidarflow.kernels import tree
 from lidarflow.lidar import ground, preparation
+from lidarflow.lidar.keypoints import Keypoints
 from lidarflow.lidar.surface import Cloud, Surface
 from lidarflow.types import Scan
 
@@ -28,18 +29,6 @@ class Masks:
     def standing(self) -> np.ndarray:
         """The usable points (N,) bool above ground."""
         return self.usable & ~self.ground
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Keypoints:
-    """Points that can be told apart.
-
-    row          (K,) int64          of the scan
-    descriptors  (K, 352) float32    SHOT of each, unit norm
-    """
-
-    row: np.ndarray
-    descriptors: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,14 +64,14 @@ def masks(scan: Scan, config: Config) -> Masks:
 
 
 def extract(scan: Scan, config: Config, beside: Aside | None = None) -> Features:
-    """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid and their descriptors.
+    """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid.
 
     All but the masks is done `beside` the caller where there is such a thing.
     """
     begin = beside.begin if beside else done
     seen = masks(scan, config)
     cloud = begin(_cloud, scan.points, seen, config)
-    return Features(seen.usable, seen.ground, cloud, begin(_keypoints, scan.points, seen, cloud, config))
+    return Features(seen.usable, seen.ground, cloud, begin(_keypoints, seen, cloud, config))
 
 
 def _cloud(points: np.ndarray, seen: Masks, config: Config) -> Cloud:
@@ -92,12 +81,8 @@ def _cloud(points: np.ndarray, seen: Masks, config: Config) -> Cloud:
         tree.build(points[seen.usable & seen.ground]))
 
 
-def _keypoints(points: np.ndarray, seen: Masks, cloud: "Future[Cloud]", config: Config) -> Keypoints:
-    upright = cloud.result().upright
-    row = np.flatnonzero(seen.standing)[
-        grid.first_per_voxel(upright.points, config.matching.keypoint_voxel_m)]
-    descriptors, _ = shot.describe(
-        points[row], upright.points[upright.thinned], upright.normals[upright.thinned],
-        config.shot.radius_m, config.shot.min_neighbours)
-    described = np.isfinite(descriptors[:, 0])
-    return Keypoints(row[described], descriptors[described])
+def _keypoints(seen: Masks, cloud: "Future[Cloud]", config: Config) -> Keypoints:
+    found = Keypoints.of(np.flatnonzero(seen.standing), cloud.result().upright, config)
+    if not config.objects.enabled:
+        found.described()     # all will be asked for
+    return found

@@ -1,15 +1,16 @@
 """From two prepared scans to the factor graph: who is a neighbour of whom, and what matches what."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.config import Config
-from lidarflow.lidar import matching
-from lidarflow.lidar.features import Keypoints
+from lidarflow.config import MatchingConfig
+from lidarflow.lidar.keypoints import Keypoints
+from lidarflow.lidar.matching import Matches
 from lidarflow.lidar.mesh import Mesh
-from lidarflow.types import FlowProblem, ScanPair
+from lidarflow.types import FlowProblem
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,39 +27,45 @@ class Graph:
     rows: np.ndarray
 
 
-def build_problem(
-    pair: ScanPair, source: Keypoints, target: Keypoints, mesh: Mesh, start: np.ndarray, config: Config,
-    sought: np.ndarray,
-) -> Graph:
-    """Variables, matches and smoothness edges of one pair (Dewan et al. 2016, section III).
+def build(points: np.ndarray, mesh: Mesh, start: np.ndarray, thinning_m: float) -> Graph:
+    """Variables and smoothness edges of a source scan (Dewan et al. 2016, section III), without matches.
 
-    start (N, 4, 4) are the start values of the source's points. Points without a mesh neighbour are left
-    out. Keypoints are matched inside a gate around where their start value puts them, if they are `sought`
-    (N,); the start values of others than these do not matter.
+    start (N, 4, 4) are the start values of its points (N, 3). Points without a mesh neighbour are left out.
     """
-    variable, rows = _variables(pair.source.points, mesh, config.graph.thinning_m)
+    variable, rows = _variables(points, mesh, thinning_m)
     edges = variable[mesh.edges]
     edges = np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1)
-    edges = np.unique(edges, axis=0).astype(np.int32) if config.graph.thinning_m else edges.astype(np.int32)
-
-    sits_here = np.zeros(len(variable), bool)
-    sits_here[rows] = True
-    in_graph = (sits_here & sought)[source.row]
-    keypoint = source.row[in_graph]
-    target_points = pair.target.points[target.row]
-    query, found = matching.match(
-        pose.apply(start[keypoint], pair.source.points[keypoint]), source.descriptors[in_graph],
-        target_points, target.descriptors, pair.dt_s, config.matching)
+    edges = np.unique(edges, axis=0).astype(np.int32) if thinning_m else edges.astype(np.int32)
     _, component = np.unique(mesh.component[rows], return_inverse=True)
     problem = FlowProblem(
-        points=pair.source.points[rows],
-        initial=start[rows],
-        match_index=variable[keypoint[query]],
-        match_target=target_points[found],
-        edges=edges,
-        component=component.astype(np.int32),
-    )
+        points[rows], start[rows], np.empty(0, np.int32), np.empty((0, 3)), edges, component.astype(np.int32))
     return Graph(problem, variable, rows)
+
+
+def matches(
+    graph: Graph, source: Keypoints, target: Keypoints, start_at: Callable[[np.ndarray], np.ndarray],
+    dt_s: float, config: MatchingConfig,
+) -> Matches:
+    """The matches of keypoints that a variable sits at, each sought around where its start value puts it.
+
+    start_at gives the start values (E, 4, 4) of points (E, 3).
+    """
+    eligible = np.flatnonzero(sit_here(graph, source.row))
+    points = source.points[eligible]
+    return Matches(source, eligible, pose.apply(start_at(points), points), target, dt_s, config)
+
+
+def matched(graph: Graph, rows: np.ndarray, places: np.ndarray) -> Graph:
+    """The graph with matches: rows (K,) of the source that variables sit at, and their places (K, 3)."""
+    problem = replace(graph.problem, match_index=graph.variable[rows], match_target=places)
+    return replace(graph, problem=problem)
+
+
+def sit_here(graph: Graph, rows: np.ndarray) -> np.ndarray:
+    """Which (K,) of the `rows` (K,) of the source a variable sits at."""
+    has_variable = np.zeros(len(graph.variable), bool)
+    has_variable[graph.rows] = True
+    return has_variable[rows]
 
 
 def focused(

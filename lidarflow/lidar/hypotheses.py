@@ -1,4 +1,4 @@
-"""What a cluster of seeds may have done: translations that matches, votes and planes propose."""
+"""What a cluster of seeds may have done: translations that votes, planes and tracks propose."""
 
 from dataclasses import dataclass
 
@@ -9,9 +9,6 @@ from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.surface import CAP_M
 from lidarflow.lidar.view import View
 
-_MATCH_RADIUS_M = 0.5    # matches this near to the seeds speak for them
-_MATCH_MODE_M = 0.15
-_MIN_MATCHES = 3
 _EXPECTED_RADIUS_M = 0.5
 _VOTE_CELL_M = 0.2
 _VOTE_PEAKS = 3
@@ -43,7 +40,7 @@ def translations(
     """Translations over ground (3,), metres, of the seeds at `rows` (K,), whose planes tell shifts (K, 3)."""
     points = view.points[rows]
     body = tree.build(points)
-    return [*_of_matches(view, body), *_of_planes(shift), *_of_expected(body, expected),
+    return [*_of_planes(shift), *_of_expected(body, expected),
             *_of_votes(view, points, body, max_shift_m)]
 
 
@@ -52,14 +49,6 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
     if len(points) <= count:
         return points
     return points[np.linspace(0, len(points) - 1, count).astype(int)]
-
-
-def _of_matches(view: View, body: Tree) -> list[np.ndarray]:
-    """The most common shift of the matches on these points, and their median."""
-    shifts = view.match_shift[neighbours.near_rows(view.matched, body, _MATCH_RADIUS_M)]
-    if len(shifts) < _MIN_MATCHES:
-        return []
-    return [votes.mode(shifts, _MATCH_MODE_M), votes.median(shifts)]
 
 
 def _of_planes(shift: np.ndarray) -> list[np.ndarray]:

@@ -1,34 +1,91 @@
 """Correspondences between keypoints of two scans, by SHOT descriptors inside a gate."""
 
+from collections.abc import Callable
+from functools import cached_property
+
 import numpy as np
 
 from lidarflow.config import MatchingConfig
 from lidarflow.kernels import matching as kernel
+from lidarflow.kernels import neighbours, tree
+from lidarflow.kernels.matching import Described
+from lidarflow.kernels.tree import Tree
+from lidarflow.lidar.keypoints import Keypoints
+
+_UNKNOWN, _NONE = -2, -1
+_ROUNDING = 1e-9
 
 
 def match(
-    predicted: np.ndarray, descriptors: np.ndarray, candidates: np.ndarray,
-    candidate_descriptors: np.ndarray, dt_s: float, config: MatchingConfig,
+    queries: Described, candidates: Described, rivals: Callable[[np.ndarray], Described], gate_m: float,
+    config: MatchingConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (K,) of the queries and rows (K,) of the candidates that are each other's match.
+    """Which queries (K,) and which candidates (K,) are each other's match.
 
-    predicted (Q, 3) is where the start value puts each query keypoint, in the frame of the candidates
-    (C, 3); the gate around it is the largest plausible speed times dt_s. A match survives when its rival
-    elsewhere in the gate is clearly worse (ratio test) and matching back from it ends near the query
-    (mutual best, within the keypoints' spacing).
+    Queries are where their start values put them, in the frame of the candidates. A match lies inside the
+    gate, and survives when its rival elsewhere in the gate is clearly worse (ratio test) and matching back
+    from it ends near the query (mutual best, within the keypoints' spacing). `rivals` gives what matching
+    back from some places (M, 3) may end at.
     """
-    gate_m = config.max_speed_m_per_s * dt_s
-    best, best_sq, rival_sq = kernel.best_in_gate(
-        predicted, descriptors, candidates, candidate_descriptors, gate_m, config.rival_radius_m)
-    clear = (best >= 0) & (best_sq <= config.max_ratio**2 * rival_sq)
-    query = np.flatnonzero(clear)
-    target = best[query]
+    best, best_sq, rival_sq = kernel.best_in_gate(queries, candidates, gate_m, config.rival_radius_m)
+    query = np.flatnonzero((best >= 0) & (best_sq <= config.max_ratio**2 * rival_sq))
+    found, of_query = np.unique(best[query], return_inverse=True)
+    matched = candidates.part(found)
+    ends = rivals(matched.points)
+    back, _, _ = kernel.best_in_gate(matched, ends, gate_m, config.rival_radius_m)
+    returned = np.append(ends.points, np.full((1, 3), np.inf), axis=0)[back[of_query]]
+    mutual = np.linalg.norm(returned - queries.points[query], axis=1) <= config.mutual_radius_m
+    return query[mutual], best[query[mutual]]
 
-    unique, inverse = np.unique(target, return_inverse=True)
-    back, _, _ = kernel.best_in_gate(
-        candidates[unique], candidate_descriptors[unique], predicted, descriptors, gate_m,
-        config.rival_radius_m)
-    returned = back[inverse]
-    error_m = np.linalg.norm(predicted[returned] - predicted[query], axis=1)
-    mutual = (returned >= 0) & (error_m <= config.mutual_radius_m)
-    return query[mutual], target[mutual]
+
+class Matches:
+    """Matches of a scan's keypoints in the next scan, each looked for when it is first asked for.
+
+    They are those among all keypoints that are eligible: whatever else is asked for changes none.
+    """
+
+    def __init__(
+        self, source: Keypoints, eligible: np.ndarray, predicted: np.ndarray, target: Keypoints, dt_s: float,
+        config: MatchingConfig,
+    ):
+        """The `eligible` (E,) of the source's keypoints, ascending, with all of the target's.
+
+        predicted (E, 3) is where start values put them, in the frame of the target.
+        """
+        self._source, self._eligible, self._target = source, eligible, target
+        self._predicted, self._config = predicted, config
+        self._gate_m = config.max_speed_m_per_s * dt_s
+        self._found = np.full(len(eligible), _UNKNOWN)
+
+    @cached_property
+    def _predicted_tree(self) -> Tree:
+        return tree.build(self._predicted)
+
+    def of(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Those of `rows` (R,) of the source scan that have a match, ascending (M,), and its place (M, 3)."""
+        own = self._source.row[self._eligible]
+        asked = np.flatnonzero(np.isin(own, rows))
+        new = asked[self._found[asked] == _UNKNOWN]
+        if len(new):
+            self._look_for(new)
+        asked = asked[self._found[asked] >= 0]
+        return own[asked], self._target.points[self._found[asked]]
+
+    def _look_for(self, asked: np.ndarray) -> None:
+        """Find the matches of some (A,) of the eligible keypoints."""
+        queries = self._described(asked)
+        targets = self._target.described(self._within_gates(self._target.tree, queries.points))
+        query, found = match(queries, targets, self._around, self._gate_m, self._config)
+        self._found[asked] = _NONE
+        self._found[np.searchsorted(self._eligible, queries.row[query])] = targets.row[found]
+
+    def _around(self, places: np.ndarray) -> Described:
+        return self._described(self._within_gates(self._predicted_tree, places))
+
+    def _described(self, chosen: np.ndarray) -> Described:
+        """Those of the eligible keypoints (C,) that have a descriptor, where they are predicted."""
+        found = self._source.described(self._eligible[chosen])
+        return found._replace(points=self._predicted[np.searchsorted(self._eligible, found.row)])
+
+    def _within_gates(self, among: Tree, points: np.ndarray) -> np.ndarray:
+        return neighbours.near_rows(among, tree.build(points), (1.0 + _ROUNDING) * self._gate_m)

@@ -33,10 +33,6 @@ class Seeds:
     shift: np.ndarray
     clusters: tuple[np.ndarray, ...]
 
-    def clustered(self) -> np.ndarray:
-        """The rows of all clusters."""
-        return self.rows[np.concatenate(self.clusters)] if self.clusters else self.rows[:0]
-
 
 def find(view: View, expected: Tree, config: ObjectsConfig) -> Seeds:
     """Unexplained points amid unexplained ones, and points whose surface is shifted as one.

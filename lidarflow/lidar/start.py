@@ -9,17 +9,16 @@ _MAX_CARRY_M = 1.0
 
 
 def carried(
-    points: np.ndarray, wanted: np.ndarray, previous_points: np.ndarray, previous: FlowResult,
-    ego_motion: np.ndarray,
+    points: np.ndarray, previous_points: np.ndarray, previous: FlowResult, ego_motion: np.ndarray
 ) -> np.ndarray:
     """Start motions (N, 4, 4) of `points` (N, 3), metres in the current source frame.
 
-    Each `wanted` (N,) point takes the motion of the nearest previous point after its flow (Dewan et al. 2016,
-    section IV); without a solved one within a metre, and where not wanted, the ego-motion.
+    Each point takes the motion of the nearest previous point after its flow (Dewan et al. 2016, section IV);
+    without a solved one within a metre, the ego-motion.
     """
     start = np.tile(ego_motion, (len(points), 1, 1))
     known = np.flatnonzero(previous.valid & previous.in_graph)
-    here = np.flatnonzero(wanted & np.isfinite(points).all(axis=1))
+    here = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(known) == 0 or len(here) == 0:
         return start
     arrived = previous_points[known] + previous.flow[known]

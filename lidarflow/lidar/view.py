@@ -4,7 +4,8 @@ All points are in the target's sensor frame after ego-motion: a static world wou
 is, and an object's motion is what it does over ground.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.evidence import Evidence, gather, tolerance
 from lidarflow.lidar.surface import CAP_M, Cloud, Counterparts, Misfit, Surface, counterparts, misfit_after
 
+Matches = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 _STANDS_OUT_M = 2.0 * CAP_M   # planes are looked for up to here
 
 
@@ -32,9 +34,8 @@ class View:
     has_appeared   (U,) bool     upright points where the source has nothing after ego-motion
     newcomers      (A, 3)        these points
     appeared       Tree          over them
-    matched        Tree          over the source points with a descriptor match
-    match_rows     (K,) int64    the rows of these points
-    match_shift    (K, 3)        from such a point to its match
+    matches        function      of rows of the source: those with a descriptor match (M,), and where it is
+                                 (M, 3)
     """
 
     source: Surface
@@ -48,23 +49,20 @@ class View:
     has_appeared: np.ndarray
     newcomers: np.ndarray
     appeared: Tree
-    matched: Tree
-    match_rows: np.ndarray
-    match_shift: np.ndarray
+    matches: Matches
 
     @property
     def points(self) -> np.ndarray:
         return self.source.points
 
-    def with_matches(self, rows: np.ndarray, places: np.ndarray) -> "View":
-        """This view with matches: rows (K,) of the source and where they are found (K, 3)."""
-        points = self.points[rows]
-        return replace(
-            self, matched=tree.build(points), match_rows=rows, match_shift=places - points)
-
     def after(self, rows: np.ndarray, over_ground: np.ndarray) -> Misfit:
         """How far the source's `rows` (K,) are from the target after the motion (4, 4)."""
         return misfit_after(self.source, rows, over_ground, self.upright, self.ground)
+
+
+def no_matches(_rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """None of the rows has a match."""
+    return np.empty(0, np.int64), np.empty((0, 3))
 
 
 def look(source: Cloud, target: Cloud, config: ObjectsConfig) -> View:
@@ -87,4 +85,4 @@ def look(source: Cloud, target: Cloud, config: ObjectsConfig) -> View:
     return View(
         source.upright, tolerance_m, gather(points, left_m, tolerance_m, everything),
         Misfit(capped_m, plane_m), at_rest, upright, target.ground, source.ground, ~was_there, newcomers,
-        tree.build(newcomers), tree.NOTHING, np.empty(0, np.int64), np.empty((0, 3)))
+        tree.build(newcomers), no_matches)
