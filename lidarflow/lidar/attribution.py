@@ -69,8 +69,7 @@ def search(
     source: Features, target: Features, ego_motion: np.ndarray, tracks: Tracks, config: Config
 ) -> Search:
     """What the scans alone tell of moving objects; `tracks` are of the pair before, in the source's frame."""
-    moved = source.cloud.moved(ego_motion, config.shot.surface_voxel_m, config.normals.radius_m)
-    view = view_of_pair.look(moved, target.cloud, config.objects)
+    view = view_of_pair.look(source.cloud.moved(ego_motion), target.cloud, config.objects)
     expected = _expected(tracks, ego_motion)
     found = seeds.find(view, expected.points, config.objects)
     rows = np.flatnonzero(source.standing)

@@ -34,20 +34,14 @@ class Surface:
 
         A voxel of 0 thins nothing.
         """
-        thinned, fitted = _fitted(points, voxel_m, radius_m)
-        return cls(points, fitted, thinned, tree.build(points))
+        thinned = grid.first_per_voxel(points, voxel_m) if voxel_m else np.arange(len(points))
+        return cls(
+            points, normals.estimate(points, points[thinned], radius_m), thinned, tree.build(points))
 
-    def moved(self, motion: np.ndarray, voxel_m: float, radius_m: float) -> "Surface":
-        """The surface of the same points after a motion (4, 4), thinned and fitted anew."""
+    def moved(self, motion: np.ndarray) -> "Surface":
+        """The same surface after a motion (4, 4)."""
         points = pose.apply(motion, self.points)
-        thinned, fitted = _fitted(points, voxel_m, radius_m)
-        return Surface(points, fitted, thinned, tree.moved(self.tree, points))
-
-
-def _fitted(points: np.ndarray, voxel_m: float, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (S,) of the thinned points (N, 3), and normals (N, 3) fitted to them."""
-    thinned = grid.first_per_voxel(points, voxel_m) if voxel_m else np.arange(len(points))
-    return thinned, normals.estimate(points, points[thinned], radius_m)
+        return Surface(points, pose.turn(motion, self.normals), self.thinned, tree.moved(self.tree, points))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,11 +51,11 @@ class Cloud:
     upright: Surface
     ground: Tree
 
-    def moved(self, motion: np.ndarray, voxel_m: float, radius_m: float) -> "Cloud":
-        """The cloud after a motion (4, 4), its surface thinned and fitted anew."""
+    def moved(self, motion: np.ndarray) -> "Cloud":
+        """The same cloud after a motion (4, 4)."""
         ground = np.empty_like(self.ground.points)
         ground[self.ground.rows] = pose.apply(motion, self.ground.points)
-        return Cloud(self.upright.moved(motion, voxel_m, radius_m), tree.moved(self.ground, ground))
+        return Cloud(self.upright.moved(motion), tree.moved(self.ground, ground))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
