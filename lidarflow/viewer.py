@@ -4,6 +4,7 @@ Entities: world/source holds the scan coloured by its motion over ground, world/
 moved scan laid over it, world/trajectory the way of the sensor, crispness the alignment before and after.
 """
 
+import atexit
 import errno
 import os
 import socket
@@ -47,6 +48,7 @@ _FOOTER = b"RRF2FOOT"        # what a recording ends with
 _FOOTER_BYTES = 64
 _PORT = 9876
 _VIEWER_START_S = 20.0
+_STALLED_S = 10.0             # a file that has not grown for so long will not grow any more
 
 
 def open_recording(path: Path | None, application_id: str = "lidarflow",
@@ -77,10 +79,14 @@ def open_stream(path: Path | None, application_id: str, spawn: bool,
 def close(stream: rr.RecordingStream, path: Path | None = None) -> None:
     """Write what is still buffered and end the recording; OSError where the file `path` lacks its end.
 
-    Rerun writes in threads of its own, which only log that a disk is full, or end.
+    Rerun writes in threads of its own, which only log that a disk is full, or end, or fall silent.
     """
     try:
-        stream.flush()
+        _flush(stream, path)
+    except TimeoutError:
+        # To end the stream, or the program as usual, would wait for that thread for ever.
+        atexit.register(_leave, stream)
+        raise
     except RuntimeError as error:
         with silenced(2):   # it would log the same
             stream.disconnect()
@@ -88,6 +94,29 @@ def close(stream: rr.RecordingStream, path: Path | None = None) -> None:
     stream.disconnect()
     if path is not None and not _ends_well(Path(path)):
         raise OSError(errno.EIO, "the end of the recording is missing, is the disk full?")
+
+
+def _flush(stream: rr.RecordingStream, path: Path | None) -> None:
+    """Write what is still buffered; TimeoutError, an OSError, where the file does not grow any more."""
+    written = -1
+    while True:
+        begun = time.monotonic()
+        try:
+            return stream.flush(timeout_sec=_STALLED_S)
+        except RuntimeError:
+            size = path.stat().st_size if path is not None else written
+            if time.monotonic() - begun < _STALLED_S / 2:
+                raise
+            if size <= written:
+                raise TimeoutError(
+                    errno.ETIMEDOUT, "the recording cannot be written, is the disk full?") from None
+            written = size
+
+
+def _leave(_stream: rr.RecordingStream) -> None:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(1)
 
 
 def _ends_well(path: Path) -> bool:
