@@ -29,7 +29,7 @@ from lidarflow.stepping import Skipped, Walk, steps
 
 CHUNK_PAIRS = 20
 WARM_UP_PAIRS = 4      # an object that is missed is expected for three more
-WARM_UP_SCANS = 10     # before these: KISS-ICP's map and thresholds have settled
+WARM_UP_SCANS = 10     # before these, with KISS-ICP, until its map and thresholds have settled
 _RETRIES = 2
 _HERE = "127.0.0.1"      # nobody else is to reach what runs on this machine
 _SAME_SHARE = 0.5      # of an object's points, for it to be the same in two chunks
@@ -65,10 +65,11 @@ class Computed:
     error: str
 
 
-def chunks_of(frames: list[int], pairs: int) -> list[Chunk]:
+def chunks_of(frames: list[int], pairs: int, config: Config) -> list[Chunk]:
     """The chunks of so many `pairs` each, the last one shorter, that the scans `frames` are split into."""
     first, last = frames[0], frames[-1]
-    return [Chunk(max(first, start - WARM_UP_PAIRS - WARM_UP_SCANS), max(first, start - WARM_UP_PAIRS), start,
+    seen = WARM_UP_SCANS if config.ego.method == "kiss_icp" else 0
+    return [Chunk(max(first, start - WARM_UP_PAIRS - seen), max(first, start - WARM_UP_PAIRS), start,
                   min(start + pairs, last)) for start in range(first, last, pairs)]
 
 

@@ -133,9 +133,9 @@ class RefineConfig:
 @dataclass(frozen=True, slots=True)
 class EgoConfig:
     method: str = setting(
-        "auto", "auto = KISS-ICP in a sequence, two-scan registration for a pair",
-        choices=("auto", "registration", "kiss_icp"))
-    refine: bool = setting(True, "register the two scans once more, from the KISS-ICP motion")
+        "registration", "what registration begins with in a sequence: the last pair's motion, or KISS-ICP's",
+        choices=("registration", "kiss_icp"))
+    refine: bool = setting(True, "false = kiss_icp as it is, without registration")
     voxel_m: float = setting(
         0.2, "clouds are thinned to this before registration, finer in small places", low=0.02)
 

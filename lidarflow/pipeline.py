@@ -92,7 +92,7 @@ class FlowEstimator:
 
     def reset(self) -> None:
         """Begin anew with the next scan; numbers of objects go on."""
-        self._odometry = ego.Odometry(self.config)
+        self._odometry = ego.odometry(self.config)
         self._scan: Scan | None = None
         self._previous: Previous | None = None
         self.tracks = Tracks(next_id=self.tracks.next_id)
@@ -106,24 +106,28 @@ class FlowEstimator:
         scan = as_scan(scan)
         source, self._scan = self._scan, scan
         if source is None:
-            self._odometry.step(scan.points)
+            self._odometry.step(scan.points, 0.0)
             preparation.require_points(scan, self.config.preparation)
             return None
         # Forgotten first: after a scan that cannot be used, the next pair must not inherit an older one's.
         previous, self._previous = self._previous, None
         tracks = self.tracks if previous else Tracks(next_id=self.tracks.next_id)
+        pair = ScanPair(source, scan)
         prepared = prepare(
-            ScanPair(source, scan), self.config, previous, lambda: self._odometry.step(scan.points), tracks)
+            pair, self.config, previous, lambda: self._odometry.step(scan.points, pair.dt_s), tracks)
         result, self.tracks = explain(prepared, self.config)
+        self._odometry.found(result.ego_motion, pair.dt_s)
         self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh)
         return result
 
     def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
-        """Take `known` for the flow from the last scan to this one; only KISS-ICP sees the scan again."""
-        self._odometry.step(scan.points)
+        """Take `known` for the flow from the last scan to this one; only odometry sees the scan again."""
         last, self._previous = self._scan, None
+        dt_s = ScanPair(last, scan).dt_s if last is not None else 0.0
+        self._odometry.step(scan.points, dt_s)
         if last is not None and known is not None:
             self._previous = Previous(last.points, known)
+            self._odometry.found(known.ego_motion, dt_s)
         self._scan, self.tracks = scan, tracks
 
 
@@ -185,8 +189,7 @@ def prepare(
         begun_target_mesh = beside.begin(_mesh, pair.target, target, config) if config.refine.rounds else None
         with timed("ego-motion"):
             ego_motion = ego.find(
-                points[source.usable], pair.target.points[target.usable], guess.result() if guess else None,
-                config.ego)
+                source.thinned, target.thinned, guess.result() if guess else None, config.ego)
         tracks, search = tracks or Tracks(), None
         if config.objects.enabled:
             with timed("features"):

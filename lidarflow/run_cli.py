@@ -83,7 +83,7 @@ def _compute(dataset: "Dataset", frames: list[int], settings: "Config", out: Pat
     """Have the pairs computed by workers; the run is put together of what they find."""
     from lidarflow import cluster, runner
 
-    chunks = cluster.chunks_of(frames, spread.chunk)
+    chunks = cluster.chunks_of(frames, spread.chunk, settings)
     kept = runner.begin(dataset, frames, settings, out, method, going)
     with cluster.connected(spread.workers, spread.scheduler) as client, progress(
             "scan pairs computed", len(frames) - 1) as bar:

@@ -22,7 +22,7 @@ from lidarflow.datasets import open_dataset
 from lidarflow.lidar import ego, registration
 from lidarflow.types import Scan, ScanPair, Truth
 
-KISS_ALONE = replace(Config(), ego=EgoConfig(refine=False))
+KISS_ALONE = replace(Config(), ego=EgoConfig(method="kiss_icp", refine=False))
 Sequence = tuple[list[Scan], list[Truth]]
 
 
@@ -46,10 +46,9 @@ def with_ground():
     return mock.patch.object(icp, "_standing", lambda scan, masks: scan.points[masks.usable])
 
 
-def point_to_point(source, target, start, config, start_off_m):
-    """The finest stage of ICP."""
-    return registration.point_to_point(
-        registration.thinned(source, 0.2), registration.thinned(target, 0.1), 0.25, start)
+def point_to_point(source, target, start, start_off_m):
+    """The finest stage of ICP, on the clouds that point-to-plane has."""
+    return registration.point_to_point(source.points, target.points, 0.25, start)
 
 
 def kiss_voxel(voxel_m: float):

@@ -152,13 +152,16 @@ def test_a_sequence_is_its_pairs(name):
         assert_array_equal(result.valid, alone.valid)
 
 
-def test_ego_is_kiss_icp_refined_along_a_sequence():
-    refined, alone = stepped("ego"), stepped("ego", replace(Config(), ego=EgoConfig(refine=False)))
-    odometry = ego.Odometry(Config())
-    by_kiss_icp = [odometry.step(scan.points) for scan, _ in drive()]
-    for (_, truth), fine, coarse, kiss in zip(drive(), refined[1:], alone[1:], by_kiss_icp[1:], strict=False):
+def test_ego_is_registration_or_kiss_icp_along_a_sequence():
+    settings = [EgoConfig(), EgoConfig(method="kiss_icp"), EgoConfig(method="kiss_icp", refine=False)]
+    registered, refined, alone = (stepped("ego", replace(Config(), ego=ego)) for ego in settings)
+    odometry = ego.KissIcp(Config())
+    by_kiss_icp = [odometry.step(scan.points, 0.1) for scan, _ in drive()]
+    for (_, truth), one, other, coarse, kiss in zip(
+            drive(), registered[1:], refined[1:], alone[1:], by_kiss_icp[1:], strict=False):
         assert_allclose(coarse.ego_motion, kiss, atol=1e-6)
-        assert off(fine.ego_motion, truth.ego_motion)[0] <= 0.03 < off(kiss, truth.ego_motion)[0]
+        assert_allclose(one.ego_motion, other.ego_motion, atol=1e-3)
+        assert off(one.ego_motion, truth.ego_motion)[0] <= 0.03 < off(kiss, truth.ego_motion)[0]
 
 
 def test_the_first_pair_bears_the_work_on_both_its_scans(monkeypatch):

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ pytest.importorskip("distributed", reason="Dask distributed is not installed: pi
 from lidarflow import cluster, io
 from lidarflow.checkpoints import Checkpoints, Numbers, numbers_of, packed, renumbered
 from lidarflow.cluster import WARM_UP_PAIRS, WARM_UP_SCANS, Chunk
-from lidarflow.config import Config
+from lidarflow.config import Config, EgoConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.methods import METHODS
 from lidarflow.runner import Going, Viewing, process
@@ -163,15 +164,17 @@ def test_workers_here_are_reached_from_here_only():
 
 # Chunks.
 
+@pytest.mark.parametrize("method, shown", [("registration", 0), ("kiss_icp", WARM_UP_SCANS)])
 @pytest.mark.parametrize("first, last, pairs", [(0, 40, 20), (3, 47, 10), (0, 1, 20), (5, 9, 1)])
-def test_chunks_hold_every_pair_once(first, last, pairs):
-    chunks = cluster.chunks_of(list(range(first, last + 1)), pairs)
+def test_chunks_hold_every_pair_once(first, last, pairs, method, shown):
+    config = replace(Config(), ego=EgoConfig(method=method))
+    chunks = cluster.chunks_of(list(range(first, last + 1)), pairs, config)
     counted = [index for chunk in chunks for index in range(chunk.start, chunk.stop)]
     assert counted == list(range(first, last))
     for chunk in chunks:
         assert first <= chunk.seen <= chunk.begin <= chunk.start < chunk.stop <= last
         assert chunk.begin == max(first, chunk.start - WARM_UP_PAIRS)
-        assert chunk.seen == max(first, chunk.begin - WARM_UP_SCANS)
+        assert chunk.seen == max(first, chunk.begin - shown)
 
 
 def test_objects_keep_their_numbers_across_chunks(street, tmp_path):
@@ -208,19 +211,21 @@ def test_objects_keep_their_numbers_across_chunks(street, tmp_path):
 
 
 @pytest.mark.slow
-def test_chunks_differ_little_where_the_warm_up_does_not_reach_the_start(tmp_path):
+@pytest.mark.parametrize("method, seen", [("registration", 16), ("kiss_icp", 6)])
+def test_chunks_differ_little_where_the_warm_up_does_not_reach_the_start(tmp_path, method, seen):
     """Odometry has seen less of the way than in one go: the flow of nearly all points is the same to 1 mm."""
     scans = 26
     dataset = open_dataset(street_folder(tmp_path / "data", scans, columns=200, seed=2))
     frames = list(range(scans))
-    chunk = cluster.chunks_of(frames, 20)[1]
-    assert chunk.seen == 6
-    process(dataset, frames, Config(), tmp_path / "run", QUIET)
-    computed = cluster.explain_chunk(dataset.source, chunk, Config(), "ours", False)
+    config = replace(Config(), ego=EgoConfig(method=method))
+    chunk = cluster.chunks_of(frames, 20, config)[1]
+    assert chunk.seen == seen
+    process(dataset, frames, config, tmp_path / "run", QUIET)
+    computed = cluster.explain_chunk(dataset.source, chunk, config, "ours", False)
     kept = Checkpoints(tmp_path)
     for index, content in computed.checkpoints:
         kept.put(index, content)
-    for step in steps(Walk.of_scans(dataset, METHODS["ours"].along(Config())), frames[20:], kept):
+    for step in steps(Walk.of_scans(dataset, METHODS["ours"].along(config)), frames[20:], kept):
         one_go = io.load_flow(tmp_path / "run" / "flow" / f"{step.pair.source.name}.npz")
         apart_m = np.linalg.norm(one_go.flow - step.result.flow, axis=1)
         assert step.restored and np.nanquantile(apart_m, 0.9) < 1e-3

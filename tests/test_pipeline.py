@@ -322,8 +322,32 @@ def test_tracked_kitti_drive():
 def ego_motion_of(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Ego-motion as the pipeline computes it for a pair, without the rest of the pipeline."""
     config = Config()
-    source, target = (p[preparation.usable(p, config.preparation)] for p in (source, target))
-    return ego.register(source, target, None, config.ego)
+    source, target = (ego.Thinned.of(p[preparation.usable(p, config.preparation)], config.ego.voxel_m)
+                      for p in (source, target))
+    return ego.register(source, target)
+
+
+def test_the_last_motion_goes_on_for_as_long_as_the_next_pair_takes():
+    guess, motion = ego.LastMotion(), pose.exp(np.array([0.0, 0.0, 0.04, 0.8, 0.02, 0.0]))
+    assert guess.step(np.empty((0, 3)), 0.0) is None
+    guess.found(motion, 0.1)
+    assert guess.step(np.empty((0, 3)), 0.1) is motion
+    assert guess.step(np.empty((0, 3)), 0.1) is None, "nothing is known of the motion to the last scan"
+    guess.found(motion, 0.1)
+    np.testing.assert_allclose(guess.step(np.empty((0, 3)), 0.2), motion @ motion, atol=1e-12)
+
+
+@pytest.mark.parametrize("wrong", [(0, 0, 0.3, 0, 0, 0), (0, 0, 0, 2.5, 0, 0), (0, 0, 3.0, 0, 0, 0),
+                                   (0, 0, 0, 200.0, 0, 0), (0.01, -0.01, 0.02, 0.2, 0.1, 0.02)])
+def test_a_wrong_guess_does_not_lead_ego_motion_astray(wrong):
+    pair, truth = pair_of(synthetic.street(rng(4)), COARSE, 5)
+    config = Config()
+    source, target = (ego.Thinned.of(scan.points[preparation.usable(scan.points, config.preparation)],
+                                     config.ego.voxel_m) for scan in (pair.source, pair.target))
+    alone = ego.find(source, target, None, config.ego)
+    assert_same_motion(alone, truth.ego_motion, 0.05, 0.15)
+    guess = pose.exp(np.array(wrong, float)) @ truth.ego_motion
+    assert_same_motion(ego.find(source, target, guess, config.ego), alone, 0.002, 0.01)
 
 
 @needs_shared

@@ -1,21 +1,25 @@
 """All points move with the sensor: ego-motion alone, the same that the method itself starts from."""
 
-from dataclasses import replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from lidarflow.baselines.whole_scan import Registered, WholeScan
-from lidarflow.config import Config
-from lidarflow.lidar import ego
+from lidarflow.lidar import ego, preparation
+from lidarflow.lidar.features import Masks
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.types import FlowResult, Scan, ScanPair
 
 
-class Ego(WholeScan):
-    """KISS-ICP along a sequence (Vizzo et al. 2023), refined by robust point-to-plane registration.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prepared(Masks):
+    thinned: ego.Thinned
 
-    The settings of section `ego` apply: ego.refine = false is KISS-ICP as published. Refined, it is the
-    stronger baseline, and shows what the objects and the graph add to it.
+
+class Ego(WholeScan):
+    """Robust point-to-plane registration, along a sequence from the last motion or from KISS-ICP's.
+
+    The settings of section `ego` apply: ego.method = "kiss_icp" with ego.refine = false is KISS-ICP as
+    published (Vizzo et al. 2023). Registered, it is the stronger baseline, and shows what the objects and the
+    graph add to it.
     """
 
     name = "ego"
@@ -23,28 +27,33 @@ class Ego(WholeScan):
     def reset(self) -> None:
         """Begin anew with the next scan."""
         super().reset()
-        self._odometry = ego.Odometry(self.config)
-        self._guess: np.ndarray | None = None
-
-    @classmethod
-    def estimate(cls, pair: ScanPair, config: Config | None = None) -> FlowResult:
-        """Flow from one scan to the next; two scans alone are registered without KISS-ICP's guess."""
-        config = config or Config()
-        return super().estimate(pair, replace(config, ego=replace(config.ego, method="registration")))
+        self._odometry = ego.odometry(self.config)
 
     def step(self, scan: Scan) -> FlowResult | None:
         """Flow from the last scan to this one; None for the first, and for one after a scan of no use."""
-        with self._timed("ego-motion"):
-            self._guess = self._odometry.step(scan.points)
+        if self._previous is None:
+            with self._timed("ego-motion"):
+                self._odometry.step(scan.points, 0.0)
         return super().step(scan)
 
     def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
         """Take the flow to this scan for known; KISS-ICP sees the scan again."""
-        self._odometry.step(scan.points)
+        dt_s = ScanPair(self._previous[0], scan).dt_s if self._previous else 0.0
+        self._odometry.step(scan.points, dt_s)
+        if self._previous and known is not None:
+            self._odometry.found(known.ego_motion, dt_s)
         super().follow(scan, known, tracks)
+
+    def _prepare(self, scan: Scan) -> _Prepared:
+        seen = super()._prepare(scan)
+        with self._timed("ego-motion"):
+            usable = preparation.usable(scan.points, self.config.preparation)
+            return _Prepared(
+                seen.usable, seen.ground, ego.Thinned.of(scan.points[usable], self.config.ego.voxel_m))
 
     def _register(self, pair, source, target) -> Registered:
         with self._timed("ego-motion"):
-            return Registered(ego.find(
-                pair.source.points[source.usable], pair.target.points[target.usable], self._guess,
-                self.config.ego))
+            guess = self._odometry.step(pair.target.points, pair.dt_s)
+            motion = ego.find(source.thinned, target.thinned, guess, self.config.ego)
+            self._odometry.found(motion, pair.dt_s)
+            return Registered(motion)

@@ -38,8 +38,7 @@ class RansacIcp(WholeScan):
                 match_source, match_target, np.random.default_rng(_SEED))
         with self._timed("registration"):
             found = ego.register(
-                pair.source.points[source.usable], pair.target.points[target.usable], start, self.config.ego,
-                np.inf if start is None else _START_OFF_M)
+                source.thinned, target.thinned, start, np.inf if start is None else _START_OFF_M)
         return Registered(
             registration.reproducible(found), match_source, match_target, int(inlier.sum()), drawn)
 

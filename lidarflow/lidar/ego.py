@@ -1,5 +1,8 @@
 """Ego-motion: the rigid motion of the static world between two scans, or along a sequence."""
 
+from dataclasses import dataclass
+from typing import Protocol
+
 import numpy as np
 
 from lidarflow import pose
@@ -19,79 +22,146 @@ from lidarflow.lidar.registration import (
 # reaches 4 m, the motion of a 10 Hz sensor at 40 m/s, and the last 0.15 m.
 _STAGES_VOXELS = (20.0, 7.5, 3.0, 1.5, 0.75)
 _COARSE_VOXELS = 5.0         # the first stage works on a cloud thinned this much more
-_GUESS_OFF_M = 0.6           # KISS-ICP is nearer than this
+_GUESS_OFF_M = 0.6           # a guess is nearer than this: a sensor at 10 Hz gains 0.1 m at 10 m/s²
+_SURPRISE_M = 0.3            # a guess farther off than this, or turned more, is looked at twice
+_SURPRISE_RAD = 0.03
+_USUAL_OVERLAP = 0.5         # within the last reach: 0.6 to 0.9 of dense scans that lie right, less if not
 _MIN_OVERLAP = 0.3           # of the source within the third stage's reach of the target, at the end
 
 
-def find(source: np.ndarray, target: np.ndarray, guess: np.ndarray | None, config: EgoConfig) -> np.ndarray:
-    """target_from_source (4, 4) of usable points (N, 3) and (M, 3), as the settings want it.
+@dataclass(frozen=True, slots=True, eq=False)
+class Thinned:
+    """A scan for registration: points (M, 3), means per voxel in metres, and their planes."""
 
-    It is the guess of `Odometry`, refined unless told otherwise, or found by registration alone. Raises
+    points: np.ndarray
+    planes: Planes
+    voxel_m: float
+
+    @classmethod
+    def of(cls, points: np.ndarray, wanted_m: float) -> "Thinned":
+        """Points (N, 3) in metres, thinned to the wanted voxel, or to a smaller one in a small place."""
+        voxel_m = voxel_for(points, wanted_m)
+        means = thinned(points, voxel_m)
+        return cls(means, Planes.of(means, voxel_m), voxel_m)
+
+
+def find(source: Thinned, target: Thinned, guess: np.ndarray | None, config: EgoConfig) -> np.ndarray:
+    """target_from_source (4, 4), as the settings want it.
+
+    It is the registration that begins at the guess, or wide without one. Where the guess turns out to be far
+    off, or little of the source to meet the target, a wide one is tried too, and the better taken. Raises
     DataError when the clouds have too little in common.
     """
-    found = guess
-    if guess is None or config.refine:
-        found = register(source, target, guess, config, np.inf if guess is None else _GUESS_OFF_M)
+    if guess is None:
+        return reproducible(register(source, target))
+    if config.method == "kiss_icp" and not config.refine:
+        return reproducible(guess)
+    try:
+        found = register(source, target, guess, _GUESS_OFF_M)
+    except DataError:
+        return reproducible(register(source, target))
+    share = _overlap(source, target, found)
+    if share < _USUAL_OVERLAP or _is_far_off(guess, found):
+        wide = register(source, target)
+        found = wide if _overlap(source, target, wide) > share else found
     return reproducible(found)
 
 
 def register(
-    source: np.ndarray, target: np.ndarray, start: np.ndarray | None, config: EgoConfig,
-    start_off_m: float = np.inf,
+    source: Thinned, target: Thinned, start: np.ndarray | None = None, start_off_m: float = np.inf
 ) -> np.ndarray:
-    """target_from_source (4, 4) of two clouds (N, 3) and (M, 3) in metres, by robust point-to-plane ICP.
+    """target_from_source (4, 4) of two clouds, by robust point-to-plane ICP.
 
     `start` is a first guess; without one the search begins wide, at the identity. A guess known to be less
     than `start_off_m` off is not searched for wider than that. Raises DataError when the clouds have too
     little in common.
     """
-    voxel_m = voxel_for(source, config.voxel_m)
-    fine = thinned(source, voxel_m), Planes.of(thinned(target, voxel_m), voxel_m)
-    target_from_source = start
+    voxel_m, target_from_source = target.voxel_m, start
     if start is None:
         coarse_m = _COARSE_VOXELS * voxel_m
-        coarse = thinned(source, coarse_m), Planes.of(thinned(target, coarse_m), coarse_m)
         target_from_source = robust_point_to_plane(
-            *coarse, [_STAGES_VOXELS[0] * voxel_m], np.eye(4))
+            thinned(source.points, coarse_m), Planes.of(thinned(target.points, coarse_m), coarse_m),
+            [_STAGES_VOXELS[0] * voxel_m], np.eye(4))
     reaches_m = [reach_voxels * voxel_m for reach_voxels in _STAGES_VOXELS[1:]]
     reaches_m = [reach_m for reach_m in reaches_m if reach_m <= start_off_m] or reaches_m[-1:]
-    target_from_source = robust_point_to_plane(*fine, reaches_m, target_from_source)
-    _require_overlap(*fine, _STAGES_VOXELS[2] * voxel_m, target_from_source)
+    target_from_source = robust_point_to_plane(source.points, target.planes, reaches_m, target_from_source)
+    _require_overlap(source, target, target_from_source)
     return target_from_source
 
 
-def _require_overlap(
-    source: np.ndarray, target: Planes, reach_m: float, target_from_source: np.ndarray
-) -> None:
+def _require_overlap(source: Thinned, target: Thinned, target_from_source: np.ndarray) -> None:
     """Raise DataError unless the motion is rigid and brings the clouds together."""
+    reach_m = _STAGES_VOXELS[2] * target.voxel_m
     is_rigid = pose.is_rigid(target_from_source, tolerance=1e-4)
-    found = overlap(source, target.tree, reach_m, target_from_source) if is_rigid else 0.0
+    found = overlap(source.points, target.planes.tree, reach_m, target_from_source) if is_rigid else 0.0
     if found < _MIN_OVERLAP:
         raise DataError(
             f"ego-motion: {found:.0%} of the first scan comes within {reach_m:.2g} m of the second, at "
             f"least {_MIN_OVERLAP:.0%} should; are these consecutive scans of one sensor?")
 
 
-class Odometry:
-    """First guesses of the ego-motion along a sequence, by KISS-ICP (Vizzo et al. 2023).
+def _overlap(source: Thinned, target: Thinned, target_from_source: np.ndarray) -> float:
+    """Share of the source that comes within the last stage's reach of the target."""
+    return overlap(
+        source.points, target.planes.tree, _STAGES_VOXELS[-1] * target.voxel_m, target_from_source)
 
-    With the setting ego.method = "registration" there are none.
-    """
+
+def _is_far_off(guess: np.ndarray, found: np.ndarray) -> bool:
+    turn, shift = np.split(pose.log(pose.inverse(guess) @ found), 2)
+    return bool(np.linalg.norm(shift) > _SURPRISE_M or np.linalg.norm(turn) > _SURPRISE_RAD)
+
+
+class Odometry(Protocol):
+    """First guesses of the ego-motion along a sequence."""
+
+    def step(self, points: np.ndarray, dt_s: float) -> np.ndarray | None:
+        """current_from_previous (4, 4) for the next scan's points (N, 3), `dt_s` after the last; if known."""
+
+    def found(self, motion: np.ndarray, dt_s: float) -> None:
+        """Hear what the motion (4, 4) to the last scan was."""
+
+
+def odometry(config: Config) -> Odometry:
+    """What gives first guesses, as the settings want it."""
+    return KissIcp(config) if config.ego.method == "kiss_icp" else LastMotion()
+
+
+class LastMotion:
+    """The sensor goes on as it did from the scan before to the last one."""
+
+    def __init__(self) -> None:
+        self._last: tuple[np.ndarray, float] | None = None
+
+    def step(self, _points: np.ndarray, dt_s: float) -> np.ndarray | None:
+        """As the last motion, which is forgotten until the next one is found."""
+        last, self._last = self._last, None
+        if last is None or last[1] == dt_s:
+            return None if last is None else last[0]
+        return pose.interpolate(np.eye(4), last[0], dt_s / last[1])
+
+    def found(self, motion: np.ndarray, dt_s: float) -> None:
+        """Hear what the motion (4, 4) to the last scan was."""
+        self._last = motion, dt_s
+
+
+class KissIcp:
+    """What KISS-ICP says (Vizzo et al. 2023), whatever else is found."""
 
     def __init__(self, config: Config):
         self._limits = config.preparation
-        self._odometry = None if config.ego.method == "registration" else _kiss_icp(self._limits)
+        self._kiss_icp = _kiss_icp(self._limits)
         self._world_from_previous: np.ndarray | None = None
 
-    def step(self, points: np.ndarray) -> np.ndarray | None:
+    def step(self, points: np.ndarray, _dt_s: float) -> np.ndarray | None:
         """current_from_previous (4, 4) for the next scan's points (N, 3); None for the first."""
-        if self._odometry is None:
-            return None
         usable = preparation.usable(points, self._limits)
-        self._odometry.register_frame(points[usable], np.empty(0))
-        world_from_current = np.array(self._odometry.last_pose)
+        self._kiss_icp.register_frame(points[usable], np.empty(0))
+        world_from_current = np.array(self._kiss_icp.last_pose)
         previous, self._world_from_previous = self._world_from_previous, world_from_current
         return None if previous is None else pose.inverse(world_from_current) @ previous
+
+    def found(self, motion: np.ndarray, dt_s: float) -> None:
+        """It has a map of its own."""
 
 
 def _kiss_icp(limits):

@@ -8,7 +8,7 @@ import numpy as np
 from lidarflow.aside import Aside, done
 from lidarflow.config import Config
 from lidarflow.kernels import tree
-from lidarflow.lidar import ground, preparation
+from lidarflow.lidar import ego, ground, preparation
 from lidarflow.lidar.keypoints import Keypoints
 from lidarflow.lidar.surface import Cloud, Surface
 from lidarflow.types import Scan
@@ -35,12 +35,18 @@ class Masks:
 class Features(Masks):
     """A prepared scan; what takes long may still be under way, and is waited for when it is asked for.
 
-    cloud      Cloud       these points: what stands upright, rows ascending, and the ground
+    cloud      Cloud           these points: what stands upright, rows ascending, and the ground
     keypoints  Keypoints
+    thinned    ego.Thinned     for registration
     """
 
+    begun_thinned: "Future[ego.Thinned]"
     begun_cloud: "Future[Cloud]"
     begun_keypoints: "Future[Keypoints]"
+
+    @property
+    def thinned(self) -> ego.Thinned:
+        return self.begun_thinned.result()
 
     @property
     def cloud(self) -> Cloud:
@@ -64,14 +70,19 @@ def masks(scan: Scan, config: Config) -> Masks:
 
 
 def extract(scan: Scan, config: Config, beside: Aside | None = None) -> Features:
-    """Prepare `scan`: mask, ground, thinned surface, keypoints on a voxel grid.
+    """Prepare `scan`: mask, ground, thinned surfaces, keypoints on a voxel grid.
 
     All but the masks is done `beside` the caller where there is such a thing.
     """
     begin = beside.begin if beside else done
+    thinned = begin(_thinned, scan.points, config)
     seen = masks(scan, config)
     cloud = begin(_cloud, scan.points, seen, config)
-    return Features(seen.usable, seen.ground, cloud, begin(_keypoints, seen, cloud, config))
+    return Features(seen.usable, seen.ground, thinned, cloud, begin(_keypoints, seen, cloud, config))
+
+
+def _thinned(points: np.ndarray, config: Config) -> ego.Thinned:
+    return ego.Thinned.of(points[preparation.usable(points, config.preparation)], config.ego.voxel_m)
 
 
 def _cloud(points: np.ndarray, seen: Masks, config: Config) -> Cloud:
