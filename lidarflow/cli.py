@@ -4,6 +4,7 @@ Heavy packages are imported inside the commands, so that --help answers at once.
 """
 
 import contextlib
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -68,6 +69,17 @@ def main() -> None:
         if stop.code == _INTERRUPTED:
             print("lidarflow: interrupted", file=sys.stderr)
         raise
+    finally:
+        _leave_what_is_stalled()
+
+
+def _leave_what_is_stalled() -> None:
+    """End the program at once where the usual way waits for ever for a recording that cannot be written."""
+    viewer = sys.modules.get("lidarflow.viewer")
+    if viewer is not None and viewer.stalled:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(1)
 
 
 def _show_version(wanted: bool) -> None:

@@ -4,7 +4,6 @@ Entities: world/source holds the scan coloured by its motion over ground, world/
 moved scan laid over it, world/trajectory the way of the sensor, crispness the alignment before and after.
 """
 
-import atexit
 import errno
 import os
 import socket
@@ -76,6 +75,10 @@ def open_stream(path: Path | None, application_id: str, spawn: bool,
     return stream
 
 
+# Streams that a thread of rerun has stopped writing. Who ends them, or the program as usual, waits for ever.
+stalled: list[rr.RecordingStream] = []
+
+
 def close(stream: rr.RecordingStream, path: Path | None = None) -> None:
     """Write what is still buffered and end the recording; OSError where the file `path` lacks its end.
 
@@ -84,8 +87,7 @@ def close(stream: rr.RecordingStream, path: Path | None = None) -> None:
     try:
         _flush(stream, path)
     except TimeoutError:
-        # To end the stream, or the program as usual, would wait for that thread for ever.
-        atexit.register(_leave, stream)
+        stalled.append(stream)
         raise
     except RuntimeError as error:
         with silenced(2):   # it would log the same
@@ -111,12 +113,6 @@ def _flush(stream: rr.RecordingStream, path: Path | None) -> None:
                 raise TimeoutError(
                     errno.ETIMEDOUT, "the recording cannot be written, is the disk full?") from None
             written = size
-
-
-def _leave(_stream: rr.RecordingStream) -> None:
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(1)
 
 
 def _ends_well(path: Path) -> bool:

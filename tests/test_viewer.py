@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -204,7 +205,7 @@ def test_paths_that_cannot_be_used_are_data_errors(tmp_path):
 class Ended:
     """A stream whose writer has ended, as when the disk is full; it says so once more when it is let go."""
 
-    def flush(self):
+    def flush(self, timeout_sec):
         raise RuntimeError("writer ended")
 
     def disconnect(self):
@@ -215,3 +216,29 @@ def test_a_recording_that_cannot_be_ended_is_one_error(capfd):
     with pytest.raises(OSError, match="is the disk full"):
         viewer.close(Ended())
     assert capfd.readouterr().err == ""
+
+
+class Silent:
+    """A stream whose writer does not answer any more; ending it would wait for ever."""
+
+    def __init__(self, path, grows):
+        self.path, self.grows = path, grows
+
+    def flush(self, timeout_sec):
+        time.sleep(timeout_sec)
+        if self.grows:
+            self.grows -= 1
+            with self.path.open("ab") as file:
+                file.write(b"more")
+        raise RuntimeError("timed out")
+
+
+@pytest.mark.parametrize("grows", [0, 2])
+def test_a_recording_that_grows_no_more_is_given_up(tmp_path, monkeypatch, grows):
+    monkeypatch.setattr(viewer, "_STALLED_S", 0.05)
+    monkeypatch.setattr(viewer, "stalled", [])
+    (tmp_path / "a.rrd").touch()
+    stream = Silent(tmp_path / "a.rrd", grows)
+    with pytest.raises(TimeoutError, match="is the disk full"):
+        viewer.close(stream, tmp_path / "a.rrd")
+    assert viewer.stalled == [stream] and stream.grows == 0
