@@ -1,6 +1,7 @@
 """Two scans in, flow out: the method from start to end."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -78,7 +79,8 @@ def estimate_flow(
     if not isinstance(pair, ScanPair):
         source, target = pair
         pair = ScanPair(as_scan(source, "source"), as_scan(target, "target"))
-    result, _ = explain(prepare(pair, config), config)
+    with Aside() as beside:
+        result, _ = explain(prepare(pair, config, beside), config)
     return result
 
 
@@ -113,11 +115,14 @@ class FlowEstimator:
         previous, self._previous = self._previous, None
         tracks = self.tracks if previous else Tracks(next_id=self.tracks.next_id)
         pair = ScanPair(source, scan)
-        prepared = prepare(
-            pair, self.config, previous, lambda: self._odometry.step(scan.points, pair.dt_s), tracks)
-        result, self.tracks = explain(prepared, self.config)
+        with Aside() as beside:
+            prepared = prepare(
+                pair, self.config, beside, previous, lambda: self._odometry.step(scan.points, pair.dt_s),
+                tracks)
+            result, self.tracks = explain(prepared, self.config)
+            target_mesh = prepared.target_mesh.result() if prepared.target_mesh else None
         self._odometry.found(result.ego_motion, pair.dt_s)
-        self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh)
+        self._previous = Previous(source.points, result, prepared.target, target_mesh)
         return result
 
     def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
@@ -149,7 +154,8 @@ class Prepared:
     """A pair up to the question what moves: features, ego-motion, meshes, and the graph.
 
     `tracks` are what earlier pairs lead to expect; `search`, where to look for objects, is None when they are
-    not looked for. The graph then has its matches, else none yet, and `matches` finds them.
+    not looked for. The graph then has its matches, else none yet, and `matches` finds them. The mesh of the
+    target, None where nothing is refined, may still be under way.
     """
 
     pair: ScanPair
@@ -157,7 +163,7 @@ class Prepared:
     target: features.Features
     ego_motion: np.ndarray
     mesh: Mesh
-    target_mesh: Mesh | None
+    target_mesh: "Future[Mesh] | None"
     tracks: Tracks
     search: Search | None
     graph: frontend.Graph
@@ -166,50 +172,46 @@ class Prepared:
 
 
 def prepare(
-    pair: ScanPair, config: Config, previous: Previous | None = None,
+    pair: ScanPair, config: Config, beside: Aside, previous: Previous | None = None,
     ego_guess: Callable[[], np.ndarray | None] | None = None, tracks: Tracks | None = None,
 ) -> Prepared:
     """All of a pair that comes before objects and solver; raises DataError for scans that cannot be used.
 
     `previous` is what the pair before left, `tracks` its objects; `ego_guess`, called once, gives a start
-    value (4, 4) for the ego-motion. Stages run beside one another; each is timed by how long it is waited
+    value (4, 4) for the ego-motion. Stages run `beside` one another; each is timed by how long it is waited
     for.
     """
     timed, points = Stopwatch(), pair.source.points
-    with Aside() as beside:
-        guess = beside.begin(ego_guess) if ego_guess else None
-        for scan in (pair.source, pair.target):
-            preparation.require_points(scan, config.preparation)
+    guess = beside.begin(ego_guess) if ego_guess else None
+    for scan in (pair.source, pair.target):
+        preparation.require_points(scan, config.preparation)
+    with timed("features"):
+        target = features.extract(pair.target, config, beside)
+        before = previous.target if previous else None
+        source = before if before is not None else features.extract(pair.source, config, beside)
+    mesh_before = previous.target_mesh if previous else None
+    begun_mesh = there(mesh_before) if mesh_before else beside.begin(_mesh, pair.source, source, config)
+    begun_graph = beside.begin(_graph, points, begun_mesh, config)
+    target_mesh = beside.begin(_mesh, pair.target, target, config) if config.refine.rounds else None
+    with timed("ego-motion"):
+        ego_motion = ego.find(source.thinned, target.thinned, guess.result() if guess else None, config.ego)
+    tracks, search = tracks or Tracks(), None
+    if config.objects.enabled:
         with timed("features"):
-            target = features.extract(pair.target, config, beside)
-            before = previous.target if previous else None
-            source = before if before is not None else features.extract(pair.source, config, beside)
-        mesh_before = previous.target_mesh if previous else None
-        begun_mesh = there(mesh_before) if mesh_before else beside.begin(_mesh, pair.source, source, config)
-        begun_target_mesh = beside.begin(_mesh, pair.target, target, config) if config.refine.rounds else None
-        with timed("ego-motion"):
-            ego_motion = ego.find(
-                source.thinned, target.thinned, guess.result() if guess else None, config.ego)
-        tracks, search = tracks or Tracks(), None
-        if config.objects.enabled:
-            with timed("features"):
-                target.begun_cloud.result()
-            with timed("evidence"):
-                search = attribution.search(source, target, ego_motion, tracks, config)
-        with timed("features"):
-            keypoints = source.keypoints, target.keypoints
-        with timed("mesh"):
-            source_mesh = begun_mesh.result()
-        with timed("graph"):
-            start_at = partial(_start, previous=previous, ego_motion=ego_motion, config=config)
-            start_motions = start_at(points) if search is None else _tiled(ego_motion, len(points))
-            graph = frontend.build(points, source_mesh, start_motions, config.graph.thinning_m)
-            matches = frontend.matches(graph, *keypoints, start_at, pair.dt_s, config.matching)
-        if search is None:
-            with timed("matching"):
-                graph = frontend.matched(graph, *matches.of(graph.rows))
-        with timed("mesh"):
-            target_mesh = begun_target_mesh.result() if begun_target_mesh else None
+            target.begun_cloud.result()
+        with timed("evidence"):
+            search = attribution.search(source, target, ego_motion, tracks, config)
+    with timed("features"):
+        keypoints = source.keypoints, target.keypoints
+    with timed("mesh"):
+        source_mesh = begun_mesh.result()
+    with timed("graph"):
+        graph = begun_graph.result()
+        start_at = partial(_start, previous=previous, ego_motion=ego_motion, config=config)
+        matches = frontend.matches(graph, *keypoints, start_at, pair.dt_s, config.matching)
+    if search is None:
+        with timed("matching"):
+            graph = frontend.matched(frontend.started(graph, start_at), *matches.of(graph.rows))
     return Prepared(
         pair, source, target, ego_motion, source_mesh, target_mesh, tracks, search, graph, matches,
         timed.seconds)
@@ -217,6 +219,10 @@ def prepare(
 
 def _mesh(scan: Scan, seen: features.Features, config: Config) -> Mesh:
     return mesh.build(scan.points, seen.standing, seen.surface, config.mesh, config.normals.radius_m)
+
+
+def _graph(points: np.ndarray, mesh: "Future[Mesh]", config: Config) -> frontend.Graph:
+    return frontend.build(points, mesh.result(), config.graph.thinning_m)
 
 
 def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
@@ -236,9 +242,11 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
         by_group = np.concatenate([found.motions, ego_motion[None]])[found.owner]   # WORLD is the last
     with timed("solver"):
         motions, solved, stats = solve(graph.problem, config.solver, config.graph.min_matches)
+    with timed("mesh"):
+        target_mesh = prepared.target_mesh.result() if prepared.target_mesh else None
     with timed("refinement"):
         dense = _spread(by_group, graph, motions)
-        near_things, refined = _refined(prepared, dense, found, config)
+        near_things, refined = _refined(prepared, target_mesh, dense, found, config)
     with timed("dense answer"):
         dense = _spread(dense, near_things, refined)
         flow = pose.apply(dense, points) - points
@@ -270,7 +278,7 @@ def _spread(dense: np.ndarray, graph: frontend.Graph, motions: np.ndarray) -> np
 
 
 def _refined(
-    prepared: Prepared, dense: np.ndarray, found: Attribution, config: Config
+    prepared: Prepared, target_mesh: Mesh | None, dense: np.ndarray, found: Attribution, config: Config
 ) -> tuple[frontend.Graph, np.ndarray]:
     """The part of the graph that may have limbs, and its motions (M, 4, 4) on the next scan's surface."""
     pair, target, limits = prepared.pair, prepared.target, config.refine
@@ -279,10 +287,10 @@ def _refined(
     kept = refinement.wanted(prepared.graph.problem, is_rigid[owner], limits)
     part = frontend.tied(prepared.graph, kept, found.owner, found.motions, prepared.ego_motion)
     motions = dense[part.rows]
-    if len(motions) and prepared.target_mesh is not None:
+    if len(motions) and target_mesh is not None:
         surface = refinement.Surface.around(
             pose.apply(motions, part.problem.points), pair.target.points,
-            np.flatnonzero(target.standing), target.cloud.upright.tree, prepared.target_mesh)
+            np.flatnonzero(target.standing), target.cloud.upright.tree, target_mesh)
         motions = refinement.refined(
             part.problem, motions, surface,
             lambda problem, settings: solve(problem, settings, config.graph.min_matches),

@@ -34,7 +34,7 @@ def evaluate_pair(dataset, index: int, config: settings.Config) -> str:
     kept = source.standing
     found = mesh.build(points, kept, source.surface, config.mesh, config.normals.radius_m)
     # The gate is centred on the point itself: nothing is known of the motion beforehand.
-    graph = frontend.build(points, found, pose.identity(len(points)), config.graph.thinning_m)
+    graph = frontend.build(points, found, config.graph.thinning_m)
     matches = frontend.matches(
         graph, source.keypoints, target.keypoints, lambda at: pose.identity(len(at)), pair.dt_s,
         config.matching)

@@ -12,6 +12,9 @@ from lidarflow.lidar.matching import Matches
 from lidarflow.lidar.mesh import Mesh
 from lidarflow.types import FlowProblem
 
+# The start values (N, 4, 4) of points (N, 3).
+StartValues = Callable[[np.ndarray], np.ndarray]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
@@ -27,10 +30,10 @@ class Graph:
     rows: np.ndarray
 
 
-def build(points: np.ndarray, mesh: Mesh, start: np.ndarray, thinning_m: float) -> Graph:
-    """Variables and smoothness edges of a source scan (Dewan et al. 2016, section III), without matches.
+def build(points: np.ndarray, mesh: Mesh, thinning_m: float) -> Graph:
+    """Variables and smoothness edges of a source scan (Dewan et al. 2016, section III), starting at rest.
 
-    start (N, 4, 4) are the start values of its points (N, 3). Points without a mesh neighbour are left out.
+    Points (N, 3) without a mesh neighbour are left out.
     """
     variable, rows = _variables(points, mesh, thinning_m)
     edges = variable[mesh.edges]
@@ -38,18 +41,21 @@ def build(points: np.ndarray, mesh: Mesh, start: np.ndarray, thinning_m: float) 
     edges = np.unique(edges, axis=0).astype(np.int32) if thinning_m else edges.astype(np.int32)
     _, component = np.unique(mesh.component[rows], return_inverse=True)
     problem = FlowProblem(
-        points[rows], start[rows], np.empty(0, np.int32), np.empty((0, 3)), edges, component.astype(np.int32))
+        points[rows], pose.identity(len(rows)), np.empty(0, np.int32), np.empty((0, 3)), edges,
+        component.astype(np.int32))
     return Graph(problem, variable, rows)
 
 
-def matches(
-    graph: Graph, source: Keypoints, target: Keypoints, start_at: Callable[[np.ndarray], np.ndarray],
-    dt_s: float, config: MatchingConfig,
-) -> Matches:
-    """The matches of keypoints that a variable sits at, each sought around where its start value puts it.
+def started(graph: Graph, start_at: StartValues) -> Graph:
+    """The graph with start values."""
+    return replace(graph, problem=replace(graph.problem, initial=start_at(graph.problem.points)))
 
-    start_at gives the start values (E, 4, 4) of points (E, 3).
-    """
+
+def matches(
+    graph: Graph, source: Keypoints, target: Keypoints, start_at: StartValues, dt_s: float,
+    config: MatchingConfig,
+) -> Matches:
+    """The matches of keypoints that a variable sits at, each sought around where its start value puts it."""
     eligible = np.flatnonzero(sit_here(graph, source.row))
     points = source.points[eligible]
     return Matches(source, eligible, pose.apply(start_at(points), points), target, dt_s, config)
