@@ -1,5 +1,6 @@
 """Ego-motion: the rigid motion of the static world between two scans, or along a sequence."""
 
+import contextlib
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -56,15 +57,19 @@ def find(source: Thinned, target: Thinned, guess: np.ndarray | None, config: Ego
         return reproducible(register(source, target))
     if config.method == "kiss_icp" and not config.refine:
         return reproducible(guess)
-    try:
+    found, share = None, 0.0
+    with contextlib.suppress(DataError):
         found = register(source, target, guess, _GUESS_OFF_M)
-    except DataError:
-        return reproducible(register(source, target))
-    share = _overlap(source, target, found)
-    if share < _USUAL_OVERLAP or _is_far_off(guess, found):
+        share = _overlap(source, target, found)
+        if share >= _USUAL_OVERLAP and not _is_far_off(guess, found):
+            return reproducible(found)
+    try:
         wide = register(source, target)
-        found = wide if _overlap(source, target, wide) > share else found
-    return reproducible(found)
+    except DataError:
+        if found is None:
+            raise
+        return reproducible(found)
+    return reproducible(wide if found is None or _overlap(source, target, wide) > share else found)
 
 
 def register(
