@@ -60,6 +60,14 @@ def test_baseline_variants(street):
     assert found.count("\n| ") > 5
 
 
+def test_ego_guesses(street):
+    found = printed("ego_guesses", street)
+    name, pairs, median_m, *_ = row(found, "street3")
+    assert (name, pairs) == ("last motion", "1") and float(median_m) < 0.5
+    *_, from_kiss_icp = (line.split(" | ") for line in found.splitlines() if line.startswith("| street3"))
+    assert from_kiss_icp[1] == "registered from KISS-ICP" and float(from_kiss_icp[4]) < 2e-3
+
+
 def test_soak(street):
     found = printed("soak", street, "--rounds", 2, "--scans", 3)
     assert "results: equal" in found and "growth after round 2: none" in found
