@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.aside import Aside, there
+from lidarflow.aside import Aside
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.lidar import (
@@ -44,7 +44,7 @@ class Previous:
     points: np.ndarray
     result: FlowResult
     target: features.Features | None = None
-    target_mesh: Mesh | None = None
+    target_mesh: "Future[Mesh] | None" = None
 
 
 class Estimator(Protocol):
@@ -120,19 +120,16 @@ class FlowEstimator:
                 pair, self.config, beside, previous, lambda: self._odometry.step(scan.points, pair.dt_s),
                 tracks)
             result, self.tracks = explain(prepared, self.config)
-            target_mesh = prepared.target_mesh.result() if prepared.target_mesh else None
         self._odometry.found(result.ego_motion, pair.dt_s)
-        self._previous = Previous(source.points, result, prepared.target, target_mesh)
+        self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh)
         return result
 
     def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
         """Take `known` for the flow from the last scan to this one; only odometry sees the scan again."""
         last, self._previous = self._scan, None
-        dt_s = ScanPair(last, scan).dt_s if last is not None else 0.0
-        self._odometry.step(scan.points, dt_s)
+        ego.follow(self._odometry, last, scan, known)
         if last is not None and known is not None:
             self._previous = Previous(last.points, known)
-            self._odometry.found(known.ego_motion, dt_s)
         self._scan, self.tracks = scan, tracks
 
 
@@ -190,7 +187,7 @@ def prepare(
         before = previous.target if previous else None
         source = before if before is not None else features.extract(pair.source, config, beside)
     mesh_before = previous.target_mesh if previous else None
-    begun_mesh = there(mesh_before) if mesh_before else beside.begin(_mesh, pair.source, source, config)
+    begun_mesh = mesh_before or beside.begin(_mesh, pair.source, source, config)
     begun_graph = beside.begin(_graph, points, begun_mesh, config)
     target_mesh = beside.begin(_mesh, pair.target, target, config) if config.refine.rounds else None
     with timed("ego-motion"):
@@ -238,7 +235,7 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
             # Around objects, matches would say what ego-motion says already.
             moving = np.flatnonzero(found.owner != WORLD)
-            graph = frontend.matched(graph, *prepared.matches.of(moving[frontend.sit_here(graph, moving)]))
+            graph = frontend.matched(graph, *prepared.matches.of(moving))
         by_group = np.concatenate([found.motions, ego_motion[None]])[found.owner]   # WORLD is the last
     with timed("solver"):
         motions, solved, stats = solve(graph.problem, config.solver, config.graph.min_matches)
@@ -323,9 +320,5 @@ def _start(
     points: np.ndarray, previous: Previous | None, ego_motion: np.ndarray, config: Config
 ) -> np.ndarray:
     if previous is None or config.graph.start == "ego":
-        return _tiled(ego_motion, len(points))
+        return np.broadcast_to(ego_motion, (len(points), 4, 4))
     return start.carried(points, previous.points, previous.result, ego_motion)
-
-
-def _tiled(motion: np.ndarray, count: int) -> np.ndarray:
-    return np.broadcast_to(motion, (count, 4, 4))

@@ -14,7 +14,7 @@ import numpy as np
 from lidarflow import pose, runner
 from lidarflow.config import Config
 from lidarflow.datasets import open_dataset
-from lidarflow.lidar import ego, preparation
+from lidarflow.lidar import ego
 
 
 def compared(folder: Path, n_scans: int | None) -> dict[str, np.ndarray]:
@@ -25,8 +25,7 @@ def compared(folder: Path, n_scans: int | None) -> dict[str, np.ndarray]:
     frames = runner.choose_frames(dataset, 0, n_scans)
     for frame in frames:
         points = dataset.scan(frame).points
-        usable = points[preparation.usable(points, config.preparation)]
-        scan = ego.Thinned.of(usable, config.ego.voxel_m)
+        scan = ego.Thinned.of(points, config)
         guess, by_kiss_icp = last_motion.step(points, 0.1), kiss_icp.step(points, 0.1)
         if before is not None:
             motion = ego.find(before, scan, guess, config.ego)
@@ -40,8 +39,7 @@ def compared(folder: Path, n_scans: int | None) -> dict[str, np.ndarray]:
 
 def apart(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     """Metres and degrees between two motions (4, 4)."""
-    turn, shift = np.split(pose.log(pose.inverse(one) @ other), 2)
-    return float(np.linalg.norm(shift)), float(np.degrees(np.linalg.norm(turn)))
+    return float(pose.translation_distance(one, other)), float(np.degrees(pose.rotation_distance(one, other)))
 
 
 def main() -> None:

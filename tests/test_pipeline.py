@@ -13,7 +13,7 @@ from lidarflow.config import Config, EgoConfig, ObjectsConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.datasets.clouds import read_points
 from lidarflow.errors import LidarflowError
-from lidarflow.lidar import ego, frontend, preparation, start
+from lidarflow.lidar import ego, frontend, start
 from lidarflow.pipeline import FlowEstimator, estimate_flow
 from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
@@ -324,9 +324,7 @@ def test_tracked_kitti_drive():
 def ego_motion_of(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Ego-motion as the pipeline computes it for a pair, without the rest of the pipeline."""
     config = Config()
-    source, target = (ego.Thinned.of(p[preparation.usable(p, config.preparation)], config.ego.voxel_m)
-                      for p in (source, target))
-    return ego.register(source, target)
+    return ego.register(ego.Thinned.of(source, config), ego.Thinned.of(target, config))
 
 
 def test_the_last_motion_goes_on_for_as_long_as_the_next_pair_takes():
@@ -344,8 +342,7 @@ def test_the_last_motion_goes_on_for_as_long_as_the_next_pair_takes():
 def test_a_wrong_guess_does_not_lead_ego_motion_astray(wrong):
     pair, truth = pair_of(synthetic.street(rng(4)), COARSE, 5)
     config = Config()
-    source, target = (ego.Thinned.of(scan.points[preparation.usable(scan.points, config.preparation)],
-                                     config.ego.voxel_m) for scan in (pair.source, pair.target))
+    source, target = (ego.Thinned.of(scan.points, config) for scan in (pair.source, pair.target))
     alone = ego.find(source, target, None, config.ego)
     assert_same_motion(alone, truth.ego_motion, 0.05, 0.15)
     guess = pose.exp(np.array(wrong, float)) @ truth.ego_motion

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 from lidarflow.baselines.whole_scan import Registered, WholeScan
-from lidarflow.lidar import ego, preparation
+from lidarflow.lidar import ego
 from lidarflow.lidar.features import Masks
 from lidarflow.lidar.tracking import Tracks
-from lidarflow.types import FlowResult, Scan, ScanPair
+from lidarflow.types import FlowResult, Scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,18 +38,13 @@ class Ego(WholeScan):
 
     def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
         """Take the flow to this scan for known; KISS-ICP sees the scan again."""
-        dt_s = ScanPair(self._previous[0], scan).dt_s if self._previous else 0.0
-        self._odometry.step(scan.points, dt_s)
-        if self._previous and known is not None:
-            self._odometry.found(known.ego_motion, dt_s)
+        ego.follow(self._odometry, self._previous[0] if self._previous else None, scan, known)
         super().follow(scan, known, tracks)
 
     def _prepare(self, scan: Scan) -> _Prepared:
         seen = super()._prepare(scan)
         with self._timed("ego-motion"):
-            usable = preparation.usable(scan.points, self.config.preparation)
-            return _Prepared(
-                seen.usable, seen.ground, ego.Thinned.of(scan.points[usable], self.config.ego.voxel_m))
+            return _Prepared(seen.usable, seen.ground, ego.Thinned.of(scan.points, self.config))
 
     def _register(self, pair, source, target) -> Registered:
         with self._timed("ego-motion"):

@@ -1,4 +1,4 @@
-"""Most common shifts: among those that are given, and among all that lead from one cloud to another."""
+"""What many shifts agree on: the median of some, and the most common that lead from one cloud to another."""
 
 import numpy as np
 
@@ -13,12 +13,6 @@ def median(shifts):
         ordered = np.sort(shifts[:, k])
         middle[k] = ordered[half] if len(shifts) % 2 else (ordered[half - 1] + ordered[half]) / 2.0
     return middle
-
-
-@njit(inline="always")
-def _apart_sq(shifts, i, j):
-    dx, dy, dz = shifts[i, 0] - shifts[j, 0], shifts[i, 1] - shifts[j, 1], shifts[i, 2] - shifts[j, 2]
-    return dx * dx + dy * dy + dz * dz
 
 
 @njit()

@@ -53,7 +53,7 @@ class Attribution:
 class Search:
     """Where in a pair to look for objects.
 
-    rows      (U,) int64   those of them that the view has
+    rows      (U,) int64   of the source, those that the view has
     view      View         before anything is matched
     expected  Expected     what earlier pairs lead to expect
     seeds     Seeds

@@ -18,6 +18,7 @@ from lidarflow.lidar.registration import (
     thinned,
     voxel_for,
 )
+from lidarflow.types import FlowResult, Scan, ScanPair
 
 # Coarse to fine: how far apart corresponding surfaces may be, in voxels. With voxels of 0.2 m the first stage
 # reaches 4 m, the motion of a 10 Hz sensor at 40 m/s, and the last 0.15 m.
@@ -39,10 +40,11 @@ class Thinned:
     voxel_m: float
 
     @classmethod
-    def of(cls, points: np.ndarray, wanted_m: float) -> "Thinned":
-        """Points (N, 3) in metres, thinned to the wanted voxel, or to a smaller one in a small place."""
-        voxel_m = voxel_for(points, wanted_m)
-        means = thinned(points, voxel_m)
+    def of(cls, points: np.ndarray, config: Config) -> "Thinned":
+        """Of the points (N, 3) in range, thinned to the wanted voxel, to a smaller one in a small place."""
+        usable = points[preparation.usable(points, config.preparation)]
+        voxel_m = voxel_for(usable, config.ego.voxel_m)
+        means = thinned(usable, voxel_m)
         return cls(means, Planes.of(means, voxel_m), voxel_m)
 
 
@@ -112,8 +114,9 @@ def _overlap(source: Thinned, target: Thinned, target_from_source: np.ndarray) -
 
 
 def _is_far_off(guess: np.ndarray, found: np.ndarray) -> bool:
-    turn, shift = np.split(pose.log(pose.inverse(guess) @ found), 2)
-    return bool(np.linalg.norm(shift) > _SURPRISE_M or np.linalg.norm(turn) > _SURPRISE_RAD)
+    return bool(
+        pose.translation_distance(guess, found) > _SURPRISE_M
+        or pose.rotation_distance(guess, found) > _SURPRISE_RAD)
 
 
 class Odometry(Protocol):
@@ -131,6 +134,14 @@ def odometry(config: Config) -> Odometry:
     return KissIcp(config) if config.ego.method == "kiss_icp" else LastMotion()
 
 
+def follow(odometry: Odometry, last: Scan | None, scan: Scan, known: FlowResult | None) -> None:
+    """Show odometry a scan after the `last` one whose motion is known already, or nothing of it."""
+    dt_s = ScanPair(last, scan).dt_s if last is not None else 0.0
+    odometry.step(scan.points, dt_s)
+    if last is not None and known is not None:
+        odometry.found(known.ego_motion, dt_s)
+
+
 class LastMotion:
     """The sensor goes on as it did from the scan before to the last one."""
 
@@ -140,9 +151,10 @@ class LastMotion:
     def step(self, _points: np.ndarray, dt_s: float) -> np.ndarray | None:
         """As the last motion, which is forgotten until the next one is found."""
         last, self._last = self._last, None
-        if last is None or last[1] == dt_s:
-            return None if last is None else last[0]
-        return pose.interpolate(np.eye(4), last[0], dt_s / last[1])
+        if last is None:
+            return None
+        motion, took_s = last
+        return motion if took_s == dt_s else pose.interpolate(np.eye(4), motion, dt_s / took_s)
 
     def found(self, motion: np.ndarray, dt_s: float) -> None:
         """Hear what the motion (4, 4) to the last scan was."""

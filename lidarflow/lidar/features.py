@@ -75,14 +75,10 @@ def extract(scan: Scan, config: Config, beside: Aside | None = None) -> Features
     All but the masks is done `beside` the caller where there is such a thing.
     """
     begin = beside.begin if beside else done
-    thinned = begin(_thinned, scan.points, config)
+    thinned = begin(ego.Thinned.of, scan.points, config)
     seen = masks(scan, config)
     cloud = begin(_cloud, scan.points, seen, config)
     return Features(seen.usable, seen.ground, thinned, cloud, begin(_keypoints, seen, cloud, config))
-
-
-def _thinned(points: np.ndarray, config: Config) -> ego.Thinned:
-    return ego.Thinned.of(points[preparation.usable(points, config.preparation)], config.ego.voxel_m)
 
 
 def _cloud(points: np.ndarray, seen: Masks, config: Config) -> Cloud:

@@ -56,7 +56,9 @@ def matches(
     config: MatchingConfig,
 ) -> Matches:
     """The matches of keypoints that a variable sits at, each sought around where its start value puts it."""
-    eligible = np.flatnonzero(sit_here(graph, source.row))
+    has_variable = np.zeros(len(graph.variable), bool)
+    has_variable[graph.rows] = True
+    eligible = np.flatnonzero(has_variable[source.row])
     points = source.points[eligible]
     return Matches(source, eligible, pose.apply(start_at(points), points), target, dt_s, config)
 
@@ -65,13 +67,6 @@ def matched(graph: Graph, rows: np.ndarray, places: np.ndarray) -> Graph:
     """The graph with matches: rows (K,) of the source that variables sit at, and their places (K, 3)."""
     problem = replace(graph.problem, match_index=graph.variable[rows], match_target=places)
     return replace(graph, problem=problem)
-
-
-def sit_here(graph: Graph, rows: np.ndarray) -> np.ndarray:
-    """Which (K,) of the `rows` (K,) of the source a variable sits at."""
-    has_variable = np.zeros(len(graph.variable), bool)
-    has_variable[graph.rows] = True
-    return has_variable[rows]
 
 
 def focused(

@@ -53,6 +53,7 @@ class Matches:
         predicted (E, 3) is where start values put them, in the frame of the target.
         """
         self._source, self._eligible, self._target = source, eligible, target
+        self._row = source.row[eligible]
         self._predicted, self._config = predicted, config
         self._gate_m = config.max_speed_m_per_s * dt_s
         self._found = np.full(len(eligible), _UNKNOWN)
@@ -63,13 +64,12 @@ class Matches:
 
     def of(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Those of `rows` (R,) of the source scan that have a match, ascending (M,), and its place (M, 3)."""
-        own = self._source.row[self._eligible]
-        asked = np.flatnonzero(np.isin(own, rows))
+        asked = np.flatnonzero(np.isin(self._row, rows))
         new = asked[self._found[asked] == _UNKNOWN]
         if len(new):
             self._look_for(new)
         asked = asked[self._found[asked] >= 0]
-        return own[asked], self._target.points[self._found[asked]]
+        return self._row[asked], self._target.points[self._found[asked]]
 
     def _look_for(self, asked: np.ndarray) -> None:
         """Find the matches of some (A,) of the eligible keypoints."""

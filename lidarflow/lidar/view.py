@@ -15,7 +15,7 @@ from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.evidence import Evidence, gather, tolerance
 from lidarflow.lidar.surface import CAP_M, Cloud, Counterparts, Misfit, Surface, counterparts, misfit_after
 
-Matches = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+MatchFinder = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 _STANDS_OUT_M = 2.0 * CAP_M   # planes are looked for up to here
 
 
@@ -49,7 +49,7 @@ class View:
     has_appeared: np.ndarray
     newcomers: np.ndarray
     appeared: Tree
-    matches: Matches
+    matches: MatchFinder
 
     @property
     def points(self) -> np.ndarray:
