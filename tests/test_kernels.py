@@ -136,7 +136,7 @@ def check_normals(count: int) -> None:
     estimated, expected = normals.estimate(points, surface, 0.5), normals_twin(points, surface, 0.5)
     np.testing.assert_array_equal(np.isnan(estimated), np.isnan(expected))
     assert np.isnan(expected).any() and np.isfinite(expected).all(axis=1).sum() >= 10
-    np.testing.assert_allclose(estimated, expected, atol=1e-8)
+    np.testing.assert_allclose(estimated, expected, atol=1e-4)     # sums are in single precision
 
 
 # ---- local shifts ---------------------------------------------------------------------------------------
@@ -165,7 +165,7 @@ def check_local_shifts(count: int) -> None:
     offsets_m[::7] = np.nan
     given = points, planes, offsets_m, 0.5
     for found, expected in zip(coherence.local_shifts(*given), local_shifts_twin(*given), strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+        np.testing.assert_allclose(found, expected, atol=1e-5)     # sums are in single precision
     shift, planes_around, before_m, after_m = coherence.local_shifts(*given)
     least, least_m = int(np.median(planes_around)), float(np.median(before_m))
     told = (planes_around >= least) & (before_m >= least_m)

@@ -5,12 +5,14 @@ import math
 import numba
 import numpy as np
 
-from lidarflow.kernels import grid
+from lidarflow.kernels import cells, lanes
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import solve_positive3
 
 _DAMPING = 0.02   # share of a full plane that an unseen direction is held back by
-_CHUNK = 256      # points that one thread takes at a time
+_CHUNK = 64       # cells of points that one thread takes at a time
+_ROWS = 7         # of a block: offsets along x, y, z, the normal, the plane's distance
+_SUMS = 11        # number, r², n r, n nᵀ
 
 
 def local_shifts(
@@ -26,71 +28,108 @@ def local_shifts(
     than `min_planes` planes, or r is less than `min_rms_m`, t is 0.
     """
     known = np.flatnonzero(np.isfinite(normals).all(axis=1) & np.isfinite(offsets_m))
-    order, keys, lower, shape = grid.build(points[known], radius_m)
-    rows = known[order]
-    return _local_shifts(points, points[rows], normals[rows], offsets_m[rows], keys, lower, shape, radius_m,
-                         min_planes, min_rms_m)
+    asked, seen = cells.build(points, radius_m), cells.build(points[known], radius_m)
+    planes = np.column_stack([points[known], normals[known], offsets_m[known]])
+    return _local_shifts(np.ascontiguousarray(points), asked, planes, seen, min_planes, min_rms_m)
 
 
 @njit(parallel=True)
-def _local_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m, min_planes,
-                  min_rms_m):
-    n = len(points)
+def _local_shifts(points, asked, planes, seen, min_planes, min_rms_m):
+    n, cell_count = len(points), len(asked.place)
     shifts, counts = np.zeros((n, 3)), np.zeros(n, np.int64)
     before_m, after_m = np.zeros(n), np.zeros(n)
-    for chunk in numba.prange((n + _CHUNK - 1) // _CHUNK):
-        start, end = chunk * _CHUNK, (chunk + 1) * _CHUNK
-        _some_shifts(points[start:end], at, normals, offsets_m, keys, lower, shape, radius_m, min_planes,
-                     min_rms_m, shifts[start:end], counts[start:end], before_m[start:end], after_m[start:end])
+    for chunk in numba.prange((cell_count + _CHUNK - 1) // _CHUNK):
+        start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, cell_count)
+        _some_shifts(points, asked, planes, seen, start, end, min_planes, min_rms_m, shifts, counts,
+                     before_m, after_m)
     return shifts, counts, before_m, after_m
 
 
 @njit()
-def _some_shifts(points, at, normals, offsets_m, keys, lower, shape, radius_m, min_planes, min_rms_m, shifts,
-                 counts, before_m, after_m):
-    starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
-    last, run_count = (0, 0, 0), 0
+def _some_shifts(points, asked, planes, seen, start, end, min_planes, min_rms_m, shifts, counts, before_m,
+                 after_m):
+    """As `local_shifts`, of the points in the cells from `start` to `end`."""
+    near, corner = np.empty(cells.NEAR, np.int64), np.empty(3)
     factor, t = np.empty((3, 3)), np.empty(3)
-    near = np.empty(len(at) + 1, np.int64)
-    for i in range(len(points)):
-        # Points that follow one another are often in one cell.
-        cell = grid.cell_of(points[i], lower, radius_m)
-        if i == 0 or cell != last:
-            last = cell
-            run_count = grid.runs_around(cell, keys, shape, starts, ends)
-        count, total_sq = 0, 0.0
-        for run in range(run_count):
-            for j in range(starts[run], ends[run]):
-                # Without a branch, which would be guessed wrong for every third.
-                near[count] = j
-                count += _distance_sq(points, i, at, j) <= radius_m * radius_m
-        for j in near[:count]:
-            total_sq += offsets_m[j] * offsets_m[j]
-        counts[i] = count
-        if count == 0:
-            continue
-        before_m[i] = after_m[i] = math.sqrt(total_sq / count)
-        if count < min_planes or before_m[i] < min_rms_m:
-            continue
-        xx = xy = xz = yy = yz = zz = rx = ry = rz = 0.0
-        for j in near[:count]:
-            r, nx, ny, nz = offsets_m[j], normals[j, 0], normals[j, 1], normals[j, 2]
-            rx, ry, rz = rx + nx * r, ry + ny * r, rz + nz * r
-            xx, xy, xz = xx + nx * nx, xy + nx * ny, xz + nx * nz
-            yy, yz, zz = yy + ny * ny, yz + ny * nz, zz + nz * nz
-        damping = _DAMPING * count
-        factor[0, 0], factor[1, 0], factor[2, 0] = xx + damping, xy, xz
-        factor[1, 1], factor[2, 1], factor[2, 2] = yy + damping, yz, zz + damping
-        t[0], t[1], t[2] = rx, ry, rz
-        solve_positive3(factor, t)
-        # |r − n·t|² summed, from the sums at hand.
-        quadratic = (xx * t[0] * t[0] + yy * t[1] * t[1] + zz * t[2] * t[2]
-                     + 2.0 * (xy * t[0] * t[1] + xz * t[0] * t[2] + yz * t[1] * t[2]))
-        left_sq = total_sq - 2.0 * (rx * t[0] + ry * t[1] + rz * t[2]) + quadratic
-        shifts[i, 0], shifts[i, 1], shifts[i, 2] = t[0], t[1], t[2]
-        after_m[i] = math.sqrt(max(left_sq, 0.0) / count)
+    sums = np.empty(_SUMS * lanes.WIDTH, np.float32)
+    for cell in range(start, end):
+        found = cells.around(seen, asked.place[cell], near)
+        for k in range(3):
+            corner[k] = asked.place[cell, k] * asked.cell_m
+        block = _gathered(planes, seen, near[:found], corner)
+        for i in asked.order[asked.bounds[cell]: asked.bounds[cell + 1]]:
+            _add_up(block, np.float32(points[i, 0] - corner[0]), np.float32(points[i, 1] - corner[1]),
+                    np.float32(points[i, 2] - corner[2]), np.float32(seen.cell_m * seen.cell_m), sums)
+            counts[i] = int(lanes.total(sums, 0))
+            if counts[i] == 0:
+                continue
+            before_m[i] = after_m[i] = math.sqrt(lanes.total(sums, 1) / counts[i])
+            if counts[i] >= min_planes and before_m[i] >= min_rms_m:
+                after_m[i] = _shift(sums, counts[i], factor, t)
+                shifts[i] = t
 
 
-@njit(inline="always")
-def _distance_sq(a, i, b, j):
-    return (a[i, 0] - b[j, 0]) ** 2 + (a[i, 1] - b[j, 1]) ** 2 + (a[i, 2] - b[j, 2]) ** 2
+@njit()
+def _gathered(planes, seen, near, corner):
+    """A block of the planes (K, 7) in some cells, their points as offsets from a corner (3,)."""
+    count = 0
+    for cell in near:
+        count += seen.bounds[cell + 1] - seen.bounds[cell]
+    block, count = lanes.blocks(_ROWS, count), 0
+    for cell in near:
+        for place in range(seen.bounds[cell], seen.bounds[cell + 1]):
+            at, plane = lanes.column(_ROWS, count), planes[seen.order[place]]
+            for k in range(3):
+                block[at + k * lanes.WIDTH] = plane[k] - corner[k]
+            for k in range(3, _ROWS):
+                block[at + k * lanes.WIDTH] = plane[k]
+            count += 1
+    lanes.pad(block, _ROWS, count)
+    return block
+
+
+@njit()
+def _add_up(block, px, py, pz, radius_sq, sums):
+    """Fill the `sums` over the planes within a radius of a place."""
+    width = lanes.WIDTH
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for k in range(_SUMS * width):
+        sums[k] = zero
+    for start in range(0, len(block), _ROWS * width):
+        own = block[start: start + _ROWS * width]
+        for k in range(width):
+            x, y, z = own[k] - px, own[width + k] - py, own[2 * width + k] - pz
+            inside = one if x * x + y * y + z * z <= radius_sq else zero
+            nx, ny, nz = own[3 * width + k], own[4 * width + k], own[5 * width + k]
+            r = inside * own[6 * width + k]
+            ix, iy, iz = inside * nx, inside * ny, inside * nz
+            sums[k] += inside
+            sums[width + k] += r * r
+            sums[2 * width + k] += r * nx
+            sums[3 * width + k] += r * ny
+            sums[4 * width + k] += r * nz
+            sums[5 * width + k] += ix * nx
+            sums[6 * width + k] += ix * ny
+            sums[7 * width + k] += ix * nz
+            sums[8 * width + k] += iy * ny
+            sums[9 * width + k] += iy * nz
+            sums[10 * width + k] += iz * nz
+
+
+@njit()
+def _shift(sums, count, factor, t):
+    """Fill the shift t (3,) that explains most, and return the root mean square of what it leaves."""
+    total_sq = lanes.total(sums, 1)
+    rx, ry, rz = lanes.total(sums, 2), lanes.total(sums, 3), lanes.total(sums, 4)
+    xx, xy, xz = lanes.total(sums, 5), lanes.total(sums, 6), lanes.total(sums, 7)
+    yy, yz, zz = lanes.total(sums, 8), lanes.total(sums, 9), lanes.total(sums, 10)
+    damping = _DAMPING * count
+    factor[0, 0], factor[1, 0], factor[2, 0] = xx + damping, xy, xz
+    factor[1, 1], factor[2, 1], factor[2, 2] = yy + damping, yz, zz + damping
+    t[0], t[1], t[2] = rx, ry, rz
+    solve_positive3(factor, t)
+    # |r − n·t|² summed, from the sums at hand.
+    quadratic = (xx * t[0] * t[0] + yy * t[1] * t[1] + zz * t[2] * t[2]
+                 + 2.0 * (xy * t[0] * t[1] + xz * t[0] * t[2] + yz * t[1] * t[2]))
+    left_sq = total_sq - 2.0 * (rx * t[0] + ry * t[1] + rz * t[2]) + quadratic
+    return math.sqrt(max(left_sq, 0.0) / count)

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from lidarflow.kernels import cells
 from lidarflow.kernels.compiled import njit
 
 
@@ -16,8 +17,8 @@ def build(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray, np
     lower = points.min(axis=0) - cell_m if len(points) else np.zeros(3)
     upper = points.max(axis=0) if len(points) else np.zeros(3)
     shape = np.floor((upper - lower) / cell_m).astype(np.int64) + 3
-    cells = np.floor((points - lower) / cell_m).astype(np.int64)
-    keys = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
+    x, y, z = np.floor((points - lower) / cell_m).astype(np.int64).T
+    keys = (x * shape[1] + y) * shape[2] + z
     order = np.argsort(keys, kind="stable")
     return order, keys[order], lower, shape
 
@@ -32,7 +33,7 @@ def voxels(points: np.ndarray, voxel_m: float) -> tuple[np.ndarray, np.ndarray]:
 
     Voxels are numbered in the order they first appear in points (N, 3).
     """
-    return numbered(np.ascontiguousarray(points), float(voxel_m))
+    return cells.numbered(np.ascontiguousarray(points), float(voxel_m))
 
 
 def means(points: np.ndarray, voxel_m: float) -> np.ndarray:
@@ -52,7 +53,7 @@ def _means(points, voxel_m):
     for i in range(len(points)):
         for k in range(3):
             placed[i, k] = points[i, k] - (lower[k] - 0.5 * voxel_m)
-    number, counts = numbered(placed, voxel_m)
+    number, counts = cells.numbered(placed, voxel_m)
     total = np.zeros((len(counts), 3))
     for i in range(len(points)):
         for k in range(3):
@@ -64,45 +65,9 @@ def _means(points, voxel_m):
 
 
 @njit()
-def numbered(points, voxel_m):
-    """As `voxels`, for other kernels."""
-    slots = 16
-    while slots < 2 * len(points):
-        slots *= 2
-    table = np.full(slots, -1)                      # number of the voxel in each slot
-    cells = np.empty((len(points), 3), np.int64)    # of each voxel
-    number, counts = np.empty(len(points), np.int64), np.zeros(len(points), np.int64)
-    found = 0
-    for i in range(len(points)):
-        x = math.floor(points[i, 0] / voxel_m)
-        y = math.floor(points[i, 1] / voxel_m)
-        z = math.floor(points[i, 2] / voxel_m)
-        slot = _hash(x, y, z) & (slots - 1)
-        while table[slot] >= 0:
-            own = cells[table[slot]]
-            if own[0] == x and own[1] == y and own[2] == z:
-                break
-            slot = (slot + 1) & (slots - 1)
-        if table[slot] < 0:
-            table[slot] = found
-            cells[found, 0], cells[found, 1], cells[found, 2] = x, y, z
-            found += 1
-        number[i] = table[slot]
-        counts[number[i]] += 1
-    return number, counts[:found].copy()
-
-
-@njit(inline="always")
-def _hash(x, y, z):
-    """Large primes spread cells (Teschner et al. 2003); what is above is folded into the low bits."""
-    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
-    return mixed ^ (mixed >> 17)
-
-
-@njit()
 def first_of_each(points, voxel_m):
     """As `first_per_voxel`, for other kernels."""
-    number, counts = numbered(points, voxel_m)
+    number, counts = cells.numbered(points, voxel_m)
     first, least_sq = np.empty(len(counts), np.int64), np.full(len(counts), np.inf)
     for i in range(len(points)):
         off_sq = 0.0

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from lidarflow.kernels import grid
 from lidarflow.kernels import tree as trees
+from lidarflow.kernels.cells import numbered
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.union_find import join, labels
 
@@ -35,7 +35,7 @@ def joined(points, link_m):
 @njit()
 def _cells(points, cell_m):
     """Cell (N,) of each point, means (V, 3) of cells from the lowest on, and the place (V,) of each there."""
-    member, counts = grid.numbered(points, cell_m)
+    member, counts = numbered(points, cell_m)
     count = len(counts)
     sums, cells = np.zeros((count, 3)), np.empty((count, 3), np.int64)
     for i in range(len(points)):

@@ -3,13 +3,15 @@
 import numba
 import numpy as np
 
-from lidarflow.kernels import grid
+from lidarflow.kernels import cells, lanes
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import plane_eigen3
 
 _MIN_NEIGHBOURS = 4
-_CHUNK = 256         # points that one thread takes at a time
+_CHUNK = 64          # cells of points that one thread takes at a time
 _MIN_SPREAD = 1e-3   # a neighbourhood thinner than this share of its length is a line, not a surface
+_ROWS = 3            # of a block: offsets along x, y, z
+_SUMS = 10           # number, offsets, and products of two of them
 
 
 def estimate(points: np.ndarray, surface: np.ndarray, radius_m: float) -> np.ndarray:
@@ -17,71 +19,90 @@ def estimate(points: np.ndarray, surface: np.ndarray, radius_m: float) -> np.nda
 
     They face the sensor at the origin. NaN where there are too few neighbours or they lie on a line.
     """
-    order, keys, lower, shape = grid.build(surface, radius_m)
-    return _estimate(points, surface[order], keys, lower, shape, radius_m)
+    asked, seen = cells.build(points, radius_m), cells.build(surface, radius_m)
+    return _estimate(np.ascontiguousarray(points), asked, np.ascontiguousarray(surface), seen)
 
 
 @njit(parallel=True)
-def _estimate(points, surface, keys, lower, shape, radius_m):
+def _estimate(points, asked, surface, seen):
     normals = np.full((len(points), 3), np.nan)
-    for chunk in numba.prange((len(points) + _CHUNK - 1) // _CHUNK):
-        start, end = chunk * _CHUNK, (chunk + 1) * _CHUNK
-        _estimate_some(points[start:end], surface, keys, lower, shape, radius_m, normals[start:end])
+    count = len(asked.place)
+    for chunk in numba.prange((count + _CHUNK - 1) // _CHUNK):
+        _estimate_some(
+            points, asked, surface, seen, chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), normals)
     return normals
 
 
 @njit()
-def _estimate_some(points, surface, keys, lower, shape, radius_m, normals):
-    starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
+def _estimate_some(points, asked, surface, seen, start, end, normals):
+    """Fill the normals (N, 3) of the points in the cells from `start` to `end`."""
+    near, corner = np.empty(cells.NEAR, np.int64), np.empty(3)
     values, across = np.empty(3), np.empty(3)
-    offsets = np.empty((0, 3))
-    last, run_count = (0, 0, 0), 0
-    for i in range(len(points)):
-        # Points that follow one another are often in one cell.
-        cell = grid.cell_of(points[i], lower, radius_m)
-        if i == 0 or cell != last:
-            last = cell
-            run_count = grid.runs_around(cell, keys, shape, starts, ends)
-            room = grid.room(starts, ends, run_count) + 1
-            if room > len(offsets):
-                offsets = np.empty((2 * room, 3))
-        count = _gather(points[i], surface, radius_m * radius_m, starts, ends, run_count, offsets)
-        if count >= _MIN_NEIGHBOURS:
-            _fit(points[i], offsets, count, values, across, normals[i])
+    sums = np.empty(_SUMS * lanes.WIDTH, np.float32)
+    for cell in range(start, end):
+        found = cells.around(seen, asked.place[cell], near)
+        for k in range(3):
+            corner[k] = asked.place[cell, k] * asked.cell_m
+        block = _gathered(surface, seen, near[:found], corner)
+        for i in asked.order[asked.bounds[cell]: asked.bounds[cell + 1]]:
+            _add_up(block, np.float32(points[i, 0] - corner[0]), np.float32(points[i, 1] - corner[1]),
+                    np.float32(points[i, 2] - corner[2]), np.float32(seen.cell_m * seen.cell_m), sums)
+            _fit(points[i], sums, values, across, normals[i])
 
 
 @njit()
-def _gather(p, surface, radius_sq, starts, ends, run_count, offsets):
-    """How many of the surface are within the radius of p (3,); fills their offsets (·, 3) from it."""
-    px, py, pz = p[0], p[1], p[2]
+def _gathered(surface, seen, near, corner):
+    """A block of the surface's points in some cells, as offsets from a corner (3,)."""
     count = 0
-    for run in range(run_count):
-        for j in range(starts[run], ends[run]):
-            x, y, z = surface[j, 0] - px, surface[j, 1] - py, surface[j, 2] - pz
-            # Written anyway, and overwritten by the next where it is too far: branches take longer.
-            offsets[count, 0], offsets[count, 1], offsets[count, 2] = x, y, z
-            count += 1 if x * x + y * y + z * z <= radius_sq else 0
-    return count
+    for cell in near:
+        count += seen.bounds[cell + 1] - seen.bounds[cell]
+    block, count = lanes.blocks(_ROWS, count), 0
+    for cell in near:
+        for place in range(seen.bounds[cell], seen.bounds[cell + 1]):
+            at = lanes.column(_ROWS, count)
+            for k in range(3):
+                block[at + k * lanes.WIDTH] = surface[seen.order[place], k] - corner[k]
+            count += 1
+    lanes.pad(block, _ROWS, count)
+    return block
 
 
 @njit()
-def _fit(p, offsets, count, values, across, normal):
-    """Fill `normal` (3,) at p (3,) from the offsets (·, 3) of its neighbours, if it has one."""
-    sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
-    for k in range(count):
-        x, y, z = offsets[k, 0], offsets[k, 1], offsets[k, 2]
-        sx += x
-        sy += y
-        sz += z
-        sxx += x * x
-        sxy += x * y
-        sxz += x * z
-        syy += y * y
-        syz += y * z
-        szz += z * z
-    mx, my, mz = sx / count, sy / count, sz / count
-    plane_eigen3(sxx / count - mx * mx, sxy / count - mx * my, sxz / count - mx * mz,
-                 syy / count - my * my, syz / count - my * mz, szz / count - mz * mz, values, across)
+def _add_up(block, px, py, pz, radius_sq, sums):
+    """Fill the `sums` over what lies within a radius of a place: number, offsets from it, their products."""
+    width = lanes.WIDTH
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for k in range(_SUMS * width):
+        sums[k] = zero
+    for start in range(0, len(block), _ROWS * width):
+        own = block[start: start + _ROWS * width]
+        for k in range(width):
+            x, y, z = own[k] - px, own[width + k] - py, own[2 * width + k] - pz
+            inside = one if x * x + y * y + z * z <= radius_sq else zero
+            ix, iy, iz = inside * x, inside * y, inside * z
+            sums[k] += inside
+            sums[width + k] += ix
+            sums[2 * width + k] += iy
+            sums[3 * width + k] += iz
+            sums[4 * width + k] += ix * x
+            sums[5 * width + k] += ix * y
+            sums[6 * width + k] += ix * z
+            sums[7 * width + k] += iy * y
+            sums[8 * width + k] += iy * z
+            sums[9 * width + k] += iz * z
+
+
+@njit()
+def _fit(p, sums, values, across, normal):
+    """Fill `normal` (3,) at p (3,) from the sums over its neighbours, if it has one."""
+    count = lanes.total(sums, 0)
+    if count < _MIN_NEIGHBOURS:
+        return
+    mx, my, mz = lanes.total(sums, 1) / count, lanes.total(sums, 2) / count, lanes.total(sums, 3) / count
+    plane_eigen3(
+        lanes.total(sums, 4) / count - mx * mx, lanes.total(sums, 5) / count - mx * my,
+        lanes.total(sums, 6) / count - mx * mz, lanes.total(sums, 7) / count - my * my,
+        lanes.total(sums, 8) / count - my * mz, lanes.total(sums, 9) / count - mz * mz, values, across)
     if values[1] <= _MIN_SPREAD * values[2]:
         return
     sign = -1.0 if across[0] * p[0] + across[1] * p[1] + across[2] * p[2] > 0.0 else 1.0

@@ -1,0 +1,51 @@
+"""Numbers of many points side by side, so that loops over them compile to vector instructions.
+
+A block holds float32 rows of WIDTH numbers, a row for each number of a point: WIDTH points stand beside one
+another in its columns, the next WIDTH in the next rows. Sums have rows of the same width, one for each sum;
+every lane adds up its own column, and lanes are added in order in the end. So the order of additions is
+fixed, as it would not be if the compiler were free to choose it.
+"""
+
+import numpy as np
+
+from lidarflow.kernels.compiled import njit
+
+WIDTH = 16
+FAR = np.float32(1e9)    # an offset that is outside any radius, where a block has no point
+
+
+@njit()
+def blocks(rows, count):
+    """Room for `count` points with so many rows each."""
+    return np.empty(rows * padded(count), np.float32)
+
+
+@njit(inline="always")
+def padded(count):
+    """How many columns as many points take: the next multiple of WIDTH."""
+    return (count + WIDTH - 1) // WIDTH * WIDTH
+
+
+@njit(inline="always")
+def column(rows, k):
+    """Where the first row of the k-th point is; the next ones are WIDTH further on."""
+    return rows * WIDTH * (k // WIDTH) + k % WIDTH
+
+
+@njit()
+def pad(block, rows, count):
+    """Fill the columns behind `count` points; the first number of each is FAR, others are 0."""
+    for k in range(count, padded(count)):
+        at = column(rows, k)
+        block[at] = FAR
+        for row in range(1, rows):
+            block[at + row * WIDTH] = 0.0
+
+
+@njit(inline="always")
+def total(sums, row):
+    """What the lanes of a row of sums add up to."""
+    added = np.float32(0.0)
+    for lane in range(WIDTH):
+        added += sums[row * WIDTH + lane]
+    return np.float64(added)
