@@ -18,6 +18,7 @@ MIN_TURNING_POINTS = 16      # fewer points do not fix a turn
 MIN_POINTS = 4
 _SETTLED = 1e-4              # a round that changes less, in metres and radians, ends its gate
 _ROUNDING_M = 1e-9           # distances are taken as equal up to this
+_BEYOND_GATE = 1.5           # nearest points are searched for this much farther than the gate
 _REGULARISATION = 1e-6       # share of all weight that directions nothing holds are held back by
 
 
@@ -176,7 +177,7 @@ def _add_pairs(
     return total, count
 
 
-@njit()
+@njit(inline="always")
 def follow(target, x, y, z, gate_m, i, place, asked, clear_m):
     """Nearest place to x, y, z within the gate, -1 without one, and its squared distance, for point i.
 
@@ -188,10 +189,19 @@ def follow(target, x, y, z, gate_m, i, place, asked, clear_m):
     if place[i] >= 0:
         apart_sq = trees.distance_sq(target.points, place[i], x, y, z)
     if min(math.sqrt(apart_sq), gate_m) >= clear_m[i] - left_m - _ROUNDING_M:
-        place[i], apart_sq, second_sq = trees.nearest_two(target, x, y, z, gate_m * gate_m)
-        clear_m[i] = math.sqrt(second_sq)
-        asked[i, 0], asked[i, 1], asked[i, 2] = x, y, z
+        apart_sq = _search(target, x, y, z, gate_m, i, place, asked, clear_m)
     return (place[i] if apart_sq < gate_m * gate_m else -1), apart_sq
+
+
+@njit()
+def _search(target, x, y, z, gate_m, i, place, asked, clear_m):
+    """Squared distance to the nearest place, which is noted for point i."""
+    # Beyond the gate as well: what is known to be empty there need not be searched again after every step.
+    reach_m = _BEYOND_GATE * gate_m
+    place[i], apart_sq, second_sq = trees.nearest_two(target, x, y, z, reach_m * reach_m)
+    clear_m[i] = math.sqrt(second_sq)
+    asked[i, 0], asked[i, 1], asked[i, 2] = x, y, z
+    return apart_sq
 
 
 @njit()

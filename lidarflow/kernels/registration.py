@@ -5,11 +5,15 @@ import math
 import numba
 import numpy as np
 
+from lidarflow.kernels import lanes
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.icp import follow
 from lidarflow.kernels.linalg import moved
 
 _CHUNK = 512     # points that one thread takes at a time; their sums are added in order
+
+_ROWS = 8        # of a block: where a point is, the plane it meets, how far off that is, what the pair weighs
+_SUMS = 28       # lower triangle of the matrix, right side, number of pairs
 
 
 class Pairs:
@@ -46,19 +50,23 @@ _LOWER = np.tril_indices(6)
 @njit(parallel=True)
 def _sums(points, motion, target, target_normals, reach_m, place, asked, clear_m):
     chunks = (len(points) + _CHUNK - 1) // _CHUNK
-    parts = np.zeros((chunks, 28))
+    parts = np.zeros((chunks, _SUMS))
     for chunk in numba.prange(chunks):
-        _add(points, chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points)), motion, target, target_normals,
-             reach_m, place, asked, clear_m, parts[chunk])
-    total = np.zeros(28)
+        start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
+        block = np.zeros(_ROWS * lanes.padded(end - start))     # columns that stay empty weigh nothing
+        parts[chunk, -1] = _meet(
+            points, start, end, motion, target, target_normals, reach_m, place, asked, clear_m, block)
+        _add_up(block, parts[chunk])
+    total = np.zeros(_SUMS)
     for chunk in range(chunks):
         total += parts[chunk]
     return total
 
 
 @njit()
-def _add(points, start, end, motion, target, target_normals, reach_m, place, asked, clear_m, total):
-    row = np.empty(6)
+def _meet(points, start, end, motion, target, target_normals, reach_m, place, asked, clear_m, block):
+    """Fill a block with the points from `start` to `end` that meet a plane; returns how many do."""
+    count, width = 0, lanes.WIDTH
     for i in range(start, end):
         x, y, z = moved(points[i], motion)
         near, _ = follow(target, x, y, z, reach_m, i, place, asked, clear_m)
@@ -68,13 +76,53 @@ def _add(points, start, end, motion, target, target_normals, reach_m, place, ask
         at = target.points[near]
         off_m = nx * (at[0] - x) + ny * (at[1] - y) + nz * (at[2] - z)
         share = 1.0 - (off_m / reach_m) ** 2
-        weight = share * share
-        row[0], row[1], row[2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
-        row[3], row[4], row[5] = nx, ny, nz
-        k = 0
-        for a in range(6):
-            for b in range(a + 1):
-                total[k] += weight * row[a] * row[b]
-                k += 1
-            total[21 + a] += weight * off_m * row[a]
-        total[27] += 1.0
+        k = lanes.column(_ROWS, count)
+        block[k], block[k + width], block[k + 2 * width] = x, y, z
+        block[k + 3 * width], block[k + 4 * width], block[k + 5 * width] = nx, ny, nz
+        block[k + 6 * width], block[k + 7 * width] = off_m, share * share
+        count += 1
+    return count
+
+
+@njit()
+def _add_up(block, total):
+    """Add the pairs of a block to the sums (_SUMS,), all but their number."""
+    width = lanes.WIDTH
+    sums = np.zeros((_SUMS - 1) * width)
+    for start in range(0, len(block), _ROWS * width):
+        own = block[start: start + _ROWS * width]
+        for k in range(width):
+            x, y, z = own[k], own[width + k], own[2 * width + k]
+            d, e, f = own[3 * width + k], own[4 * width + k], own[5 * width + k]
+            off_m, weight = own[6 * width + k], own[7 * width + k]
+            a, b, c = y * f - z * e, z * d - x * f, x * e - y * d
+            wa, wb, wc, wd, we, wf = weight * a, weight * b, weight * c, weight * d, weight * e, weight * f
+            sums[k] += wa * a
+            sums[width + k] += wb * a
+            sums[2 * width + k] += wb * b
+            sums[3 * width + k] += wc * a
+            sums[4 * width + k] += wc * b
+            sums[5 * width + k] += wc * c
+            sums[6 * width + k] += wd * a
+            sums[7 * width + k] += wd * b
+            sums[8 * width + k] += wd * c
+            sums[9 * width + k] += wd * d
+            sums[10 * width + k] += we * a
+            sums[11 * width + k] += we * b
+            sums[12 * width + k] += we * c
+            sums[13 * width + k] += we * d
+            sums[14 * width + k] += we * e
+            sums[15 * width + k] += wf * a
+            sums[16 * width + k] += wf * b
+            sums[17 * width + k] += wf * c
+            sums[18 * width + k] += wf * d
+            sums[19 * width + k] += wf * e
+            sums[20 * width + k] += wf * f
+            sums[21 * width + k] += wa * off_m
+            sums[22 * width + k] += wb * off_m
+            sums[23 * width + k] += wc * off_m
+            sums[24 * width + k] += wd * off_m
+            sums[25 * width + k] += we * off_m
+            sums[26 * width + k] += wf * off_m
+    for row in range(_SUMS - 1):
+        total[row] += lanes.total(sums, row)

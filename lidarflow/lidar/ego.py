@@ -91,7 +91,9 @@ def register(
             [_STAGES_VOXELS[0] * voxel_m], np.eye(4))
     reaches_m = [reach_voxels * voxel_m for reach_voxels in _STAGES_VOXELS[1:]]
     reaches_m = [reach_m for reach_m in reaches_m if reach_m <= start_off_m] or reaches_m[-1:]
-    target_from_source = robust_point_to_plane(source.points, target.planes, reaches_m, target_from_source)
+    # In the order of a tree, points that follow one another meet planes that do.
+    target_from_source = robust_point_to_plane(
+        source.planes.tree.points, target.planes, reaches_m, target_from_source)
     _require_overlap(source, target, target_from_source)
     return target_from_source
 

@@ -15,9 +15,10 @@ _SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range
 _NORMAL_RADIUS_VOXELS = 3.5
 _MIN_POINTS = 30
 _SETTLED = 1e-5              # a step that stays below it, in metres and radians, ends a registration
-_NEARLY_SETTLED = 1e-3       # and that ends a stage another one follows
+_NEARLY_SETTLED = 1e-4       # and that ends a stage another one follows
 _SETTLED_SHARE = 1e-7        # relative change of fit and residual that ends a point-to-point ICP
 _MOST_ROUNDS = 30
+_LEADING_POINTS = 8000       # points that lead a registration to its last reach, about
 _OVERLAP_SAMPLE = 2000       # points; they tell a share to 0.02
 _HOLD = 1e-9
 _REPRODUCIBLE_DECIMALS = 9
@@ -25,7 +26,8 @@ _REPRODUCIBLE_DECIMALS = 9
 
 def voxel_for(points: np.ndarray, wanted_m: float) -> float:
     """Voxel in metres to thin points (N, 3) to: the wanted one, or a smaller one in a small place."""
-    scene_m = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+    range_sq = np.einsum("ij,ij->i", points, points)
+    scene_m = float(np.sqrt(np.median(range_sq))) if len(points) else 0.0
     return min(wanted_m, _SCENE_VOXEL_SHARE * scene_m)
 
 
@@ -59,21 +61,31 @@ def robust_point_to_plane(
 ) -> np.ndarray:
     """target_from_source (4, 4) of points (N, 3) from `start` (4, 4), by Gauss-Newton steps.
 
-    Tukey's loss lets moving objects go. It is as wide as one reach after the other, the widest first.
+    Tukey's loss lets moving objects go. It is as wide as one reach after the other, the widest first. What is
+    found within the last reach counts; before, some of the points, evenly over their order, lead there.
     """
-    motion, pairs = start, kernel.Pairs(len(source))
+    some = source[::max(len(source) // _LEADING_POINTS, 1)]
+    motion, pairs = start, kernel.Pairs(len(some))
     for reach_m in reaches_m:
-        settled = _SETTLED if reach_m == reaches_m[-1] else _NEARLY_SETTLED
-        for _ in range(_MOST_ROUNDS):
-            matrix, right, count = kernel.normal_equations(
-                source, motion, target.tree, target.normals, reach_m, pairs)
-            if count < _MIN_POINTS:
-                break
-            # What no plane holds, as in a corridor, is left where it is.
-            step = np.linalg.solve(matrix + _HOLD * np.trace(matrix) * np.eye(6), right)
-            motion = pose.exp(step) @ motion
-            if np.abs(step).max() < settled:
-                break
+        motion = _settled(some, target, reach_m, motion, pairs, _NEARLY_SETTLED)
+    return _settled(source, target, reaches_m[-1], motion, kernel.Pairs(len(source)), _SETTLED)
+
+
+def _settled(
+    source: np.ndarray, target: Planes, reach_m: float, motion: np.ndarray, pairs: kernel.Pairs,
+    settled: float,
+) -> np.ndarray:
+    """`motion` (4, 4) after steps within one reach, until one is smaller than `settled`."""
+    for _ in range(_MOST_ROUNDS):
+        matrix, right, count = kernel.normal_equations(
+            source, motion, target.tree, target.normals, reach_m, pairs)
+        if count < _MIN_POINTS:
+            break
+        # What no plane holds, as in a corridor, is left where it is.
+        step = np.linalg.solve(matrix + _HOLD * np.trace(matrix) * np.eye(6), right)
+        motion = pose.exp(step) @ motion
+        if np.abs(step).max() < settled:
+            break
     return motion
 
 
