@@ -26,6 +26,11 @@ def moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
     Each is deceived by something else: distances by leaves that flicker and by places seen anew, planes by
     walls along which any motion fits, matches by what looks alike.
     """
+    return seems_to_move(view, body, dt_s, config) and matches_agree(view, body, config)
+
+
+def seems_to_move(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
+    """Whether all but the matches, which cost most, says that a body moves."""
     points = view.points[body.rows]
     moved = pose.apply(body.over_ground, points)
     shift = (moved - points).mean(axis=0)
@@ -38,8 +43,18 @@ def moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
             view, body, moved, shift, config)
         and _clearance(view, points) <= config.max_clearance_m
         and _shape_ratio(view, body, moved) <= config.max_shape_ratio
-        and not _surroundings_gain(view, body, shift)
-        and _matches_agree(view, body, shift, config))
+        and not _surroundings_gain(view, body, shift))
+
+
+def matches_agree(view: View, body: Body, config: ObjectsConfig) -> bool:
+    """Whether the body's median descriptor match is nearer to its motion than to rest, along the ground."""
+    rows, places = view.matches(body.rows)
+    if len(rows) < max(config.min_matches, 1):
+        return config.min_matches == 0
+    points = view.points[body.rows]
+    shift = (pose.apply(body.over_ground, points) - points).mean(axis=0)
+    off = votes.median(places - pose.apply(body.over_ground, view.points[rows]))
+    return np.hypot(off[0], off[1]) <= min(config.max_match_deviation * np.hypot(shift[0], shift[1]), CAP_M)
 
 
 def _clearance(view: View, points: np.ndarray) -> float:
@@ -88,15 +103,6 @@ def _observability(view: View, body: Body, shift: np.ndarray) -> float:
     normals = view.source.normals[body.rows]
     normals = normals[np.isfinite(normals).all(axis=1)]
     return float(((normals @ (shift / np.linalg.norm(shift))) ** 2).mean()) if len(normals) else 0.0
-
-
-def _matches_agree(view: View, body: Body, shift: np.ndarray, config: ObjectsConfig) -> bool:
-    """Whether the body's median descriptor match is nearer to its motion than to rest, along the ground."""
-    rows, places = view.matches(body.rows)
-    if len(rows) < max(config.min_matches, 1):
-        return config.min_matches == 0
-    off = votes.median(places - pose.apply(body.over_ground, view.points[rows]))
-    return np.hypot(off[0], off[1]) <= min(config.max_match_deviation * np.hypot(shift[0], shift[1]), CAP_M)
 
 
 def _left_and_arrived(view: View, body: Body, moved: np.ndarray) -> tuple[float, float]:

@@ -1,13 +1,15 @@
 """Moving objects: neighbouring points with one rigid motion that clearly beats ego-motion."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import ObjectsConfig
 from lidarflow.kernels import misfit as misfit_kernel
 from lidarflow.lidar import body, hypotheses, rigid_fit, seeds
-from lidarflow.lidar.acceptance import moves
-from lidarflow.lidar.body import Body
+from lidarflow.lidar.acceptance import matches_agree, moves, seems_to_move
+from lidarflow.lidar.body import Body, Growth
 from lidarflow.lidar.surface import CAP_M, MIN_AGREEMENT, Misfit
 from lidarflow.lidar.view import View
 from lidarflow.types import MovingObject
@@ -31,9 +33,10 @@ def find(
     bodies, free = [], np.ones(len(view.points), bool)
     # All grow at once, as if each were alone; who meets what another has taken grows again.
     moving = [number for number, start in enumerate(starts) if start is not None]
-    alone = dict(zip(moving, body.grown(
+    alone = dict(zip(moving, _candidates(
         view, [found.rows[found.clusters[number]] for number in moving],
-        [starts[number] for number in moving], free, config), strict=True))
+        [starts[number] for number in moving], free, dt_s, config), strict=True))
+    _match_at_once(view, list(alone.values()))
     taken = np.empty(0, np.int64)
     for number, (cluster, start) in enumerate(zip(found.clusters, starts, strict=True)):
         mine = cluster[free[found.rows[cluster]]]
@@ -41,18 +44,36 @@ def find(
             start, = _best_starts(view, found, (mine,), expected)
         if start is None:
             continue
-        grown = alone.get(number)
-        if grown is None or len(mine) < len(cluster) or grown.asked[taken].any():
-            grown, = body.grown(view, [found.rows[mine]], [start], free, config)
-        if grown.body is None or not moves(view, grown.body, dt_s, config):
+        candidate = alone.get(number)
+        if candidate is None or len(mine) < len(cluster) or candidate.asked[taken].any():
+            candidate, = _candidates(view, [found.rows[mine]], [start], free, dt_s, config)
+        if candidate.body is None or not matches_agree(view, candidate.body, config):
             continue
-        whole = body.completed(view, grown.body, free)
+        whole = body.completed(view, candidate.body, free)
         # What a body surrounds must not speak against it.
         if moves(view, whole, dt_s, config):
             bodies.append(whole)
             free[whole.rows] = False
             taken = np.flatnonzero(~free)
     return bodies
+
+
+def _candidates(
+    view: View, seeds: list[np.ndarray], starts: list[np.ndarray], free: np.ndarray, dt_s: float,
+    config: ObjectsConfig,
+) -> list[Growth]:
+    """What grows of seeds, rows (K,) each; bodies that anything but matches speaks against are left out."""
+    return [
+        growth if growth.body is not None and seems_to_move(view, growth.body, dt_s, config)
+        else replace(growth, body=None)
+        for growth in body.grown(view, seeds, starts, free, config)]
+
+
+def _match_at_once(view: View, candidates: list[Growth]) -> None:
+    """Have the view find matches that will be asked for one body after the other: together they take less."""
+    rows = [candidate.body.rows for candidate in candidates if candidate.body is not None]
+    if rows:
+        view.matches(np.concatenate(rows))
 
 
 def describe(
