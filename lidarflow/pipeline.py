@@ -236,29 +236,29 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
             # Around objects, matches would say what ego-motion says already.
             moving = np.flatnonzero(found.owner != WORLD)
             graph = frontend.matched(graph, *prepared.matches.of(moving))
-        by_group = np.concatenate([found.motions, ego_motion[None]])[found.owner]   # WORLD is the last
+        by_group = np.concatenate([found.motions, ego_motion[None]])   # WORLD is the last
     with timed("solver"):
         motions, solved, stats = solve(graph.problem, config.solver, config.graph.min_matches)
     with timed("mesh"):
         target_mesh = prepared.target_mesh.result() if prepared.target_mesh else None
     with timed("refinement"):
-        dense = _spread(by_group, graph, motions)
-        near_things, refined = _refined(prepared, target_mesh, dense, found, config)
+        near_things, refined = _refined(prepared, target_mesh, graph, motions, by_group, found, config)
     with timed("dense answer"):
-        dense = _spread(dense, near_things, refined)
-        flow = pose.apply(dense, points) - points
         in_graph = (graph.variable >= 0) | (near_things.variable >= 0)
+        dense, moved = _dense(points, by_group, found.owner, ((graph, motions), (near_things, refined)))
+        flow = moved - points
+        std_m = _std(points, found, graph, motions, solved, in_graph, flow, by_group, config)
         is_solved = (near_things.variable >= 0) | np.append(solved, False)[graph.variable]
+        is_solved &= np.isfinite(std_m)     # what let all its matches go rests on none of them
         is_dynamic = found.owner != WORLD
         if not prepared.search:
-            residual_flow = flow - (pose.apply(ego_motion, points) - points)
+            residual_flow = moved - pose.apply(ego_motion, points)
             is_dynamic = dynamic.detect(
                 points, residual_flow, is_solved, prepared.mesh.edges, ego_motion,
                 pair.target.points[prepared.target.usable], pair.dt_s, config.dynamic)
         matches = graph.problem.points[graph.problem.match_index], graph.problem.match_target
         valid = source.ground | found.explained | is_solved
         object_id = np.append(found.ids, np.int32(-1))[found.owner]
-        std_m = _std(points, found, graph, motions, solved, in_graph, flow, by_group, config)
         std_m[~valid] = np.nan
     result = FlowResult(
         flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,
@@ -266,24 +266,43 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
     return result, found.tracks
 
 
-def _spread(dense: np.ndarray, graph: frontend.Graph, motions: np.ndarray) -> np.ndarray:
-    """Motions (N, 4, 4) of all points, those of the graph's variables (M, 4, 4) put in."""
-    rows = np.flatnonzero(graph.variable >= 0)
-    spread = dense.copy()
-    spread[rows] = motions[graph.variable[rows]]
-    return spread
+def _dense(
+    points: np.ndarray, by_group: np.ndarray, owner: np.ndarray,
+    parts: tuple[tuple[frontend.Graph, np.ndarray], ...],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motions (N, 4, 4) of points (N, 3), and where they go (N, 3).
+
+    Each point has the motion of its group, by_group (G + 1, 4, 4), the last being the world's, unless it is
+    in a part of the graph, with variables that have their own (M, 4, 4); the last part counts.
+    """
+    motions = np.empty((len(points), 4, 4))
+    motions[:] = by_group[WORLD]
+    has_own = owner != WORLD
+    motions[has_own] = by_group[owner[has_own]]
+    for graph, of_variables in parts:
+        rows = np.flatnonzero(graph.variable >= 0)
+        motions[rows] = of_variables[graph.variable[rows]]
+        has_own[rows] = True
+    moved = pose.apply(by_group[WORLD], points)
+    moved[has_own] = pose.apply(motions[has_own], points[has_own])
+    return motions, moved
 
 
 def _refined(
-    prepared: Prepared, target_mesh: Mesh | None, dense: np.ndarray, found: Attribution, config: Config
+    prepared: Prepared, target_mesh: Mesh | None, graph: frontend.Graph, solved: np.ndarray,
+    by_group: np.ndarray, found: Attribution, config: Config,
 ) -> tuple[frontend.Graph, np.ndarray]:
-    """The part of the graph that may have limbs, and its motions (M, 4, 4) on the next scan's surface."""
+    """The part of the graph that may have limbs, and its motions (M, 4, 4) on the next scan's surface.
+
+    They begin at what was `solved` for the variables (V, 4, 4) of `graph`, elsewhere at the group's motion.
+    """
     pair, target, limits = prepared.pair, prepared.target, config.refine
     is_rigid = np.array([*(o.box_size.max() > limits.max_size_m for o in found.objects), False])
     owner = frontend.owners(prepared.graph, found.owner)
     kept = refinement.wanted(prepared.graph.problem, is_rigid[owner], limits)
     part = frontend.tied(prepared.graph, kept, found.owner, found.motions, prepared.ego_motion)
-    motions = dense[part.rows]
+    motions, variable = by_group[found.owner[part.rows]], graph.variable[part.rows]
+    motions[variable >= 0] = solved[variable[variable >= 0]]
     if len(motions) and target_mesh is not None:
         surface = refinement.Surface.around(
             pose.apply(motions, part.problem.points), pair.target.points,
@@ -307,7 +326,8 @@ def _std(
     std_m = found.std_m.copy()
     if config.objects.enabled:
         own = points[in_graph]
-        apart_m = np.linalg.norm(pose.apply(by_group[in_graph], own) - own - flow[in_graph], axis=1)
+        by_own_group = pose.apply(by_group[found.owner[in_graph]], own)
+        apart_m = np.linalg.norm(by_own_group - own - flow[in_graph], axis=1)
         std_m[in_graph] = np.hypot(std_m[in_graph], apart_m)
         return std_m
     rows = graph.rows[solved]

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidarflow import pose
-from lidarflow.kernels import grid, neighbours
+from lidarflow.kernels import deviation, grid, neighbours
 from lidarflow.lidar.body import Body
 from lidarflow.lidar.surface import CAP_M, Counterparts, counterparts
 from lidarflow.lidar.view import View
@@ -88,15 +88,8 @@ def _std(
     for direction in held:
         row = np.concatenate([np.zeros(3), direction])
         information += np.outer(row, row) / _LEAST_STD_M**2
-    covariance = np.linalg.inv(information)
-    # A point at x moves by ω × x + t. This is the trace of J C Jᵀ with J = [−hat(x), I].
-    x = moved - centre
-    turns, both, shifts = covariance[:3, :3], covariance[:3, 3:], covariance[3:, 3:]
-    axial = np.array([both[2, 1] - both[1, 2], both[0, 2] - both[2, 0], both[1, 0] - both[0, 1]])
-    by_turn_sq = np.einsum("ni,ni->n", x @ (np.trace(turns) * np.eye(3) - turns), x)
-    by_fit_sq = np.trace(shifts) + 2.0 * (x @ axial) + by_turn_sq
-    by_angle_sq = (_CALIBRATION_RAD**2) * np.einsum("ni,ni->n", moved, moved)
-    return np.sqrt(by_fit_sq + _CALIBRATION_M**2 + by_angle_sq)
+    return deviation.of_twist(
+        np.linalg.inv(information), np.ascontiguousarray(moved), centre, _CALIBRATION_M, _CALIBRATION_RAD)
 
 
 def of_matches(problem: FlowProblem, motions: np.ndarray, truncation_m: float) -> np.ndarray:

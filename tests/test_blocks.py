@@ -1,0 +1,94 @@
+"""Cells found by hashing, numbers side by side, and what a twist's covariance means, against slow twins."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from lidarflow import pose
+from lidarflow.kernels import cells, deviation, lanes
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def check_cells(count: int) -> None:
+    points = rng(0).uniform(-3, 3, (count, 3))
+    points[: count // 8] = points[count // 8: 2 * (count // 8)]
+    found = cells.build(points, 0.7)
+    places = np.floor(points / 0.7).astype(int)
+    _, first = np.unique(places, axis=0, return_index=True)
+    np.testing.assert_array_equal(found.place, places[np.sort(first)])
+    assert found.bounds[0] == 0 and found.bounds[-1] == count
+    for cell, place in enumerate(found.place):
+        members = found.order[found.bounds[cell]: found.bounds[cell + 1]]
+        np.testing.assert_array_equal(members, np.flatnonzero((places == place).all(axis=1)))
+    near = np.empty(cells.NEAR, np.int64)
+    for place in [*found.place[::5], np.array([90, -7, 0])]:
+        touching = np.flatnonzero((np.abs(found.place - place) <= 1).all(axis=1))
+        assert sorted(near[: cells.around(found, place, near)]) == touching.tolist()
+
+
+def check_no_cells() -> None:
+    found = cells.build(np.empty((0, 3)), 0.7)
+    assert len(found.place) == 0 and found.bounds.tolist() == [0]
+    assert cells.around(found, np.zeros(3, np.int64), np.empty(cells.NEAR, np.int64)) == 0
+
+
+def check_lanes(count: int) -> None:
+    numbers = rng(1).normal(size=(count, 3)).astype(np.float32)
+    block = lanes.blocks(3, count)
+    assert len(block) == 3 * lanes.padded(count) and 0 <= lanes.padded(count) - count < lanes.WIDTH
+    block[:] = np.nan
+    for k, point in enumerate(numbers):
+        for row in range(3):
+            block[lanes.column(3, k) + row * lanes.WIDTH] = point[row]
+    lanes.pad(block, 3, count)
+    rows = block.reshape(-1, 3, lanes.WIDTH).transpose(0, 2, 1).reshape(-1, 3)
+    np.testing.assert_array_equal(rows[:count], numbers)
+    assert (rows[count:] == [lanes.FAR, 0.0, 0.0]).all()
+    sums = np.concatenate([np.zeros(lanes.WIDTH), np.arange(lanes.WIDTH)]).astype(np.float32)
+    assert lanes.total(sums, 1) == lanes.WIDTH * (lanes.WIDTH - 1) / 2
+
+
+def check_deviation(count: int) -> None:
+    random = rng(2)
+    root, points, centre = 0.01 * random.normal(size=(6, 6)), random.normal(0, 9, (count, 3)), np.arange(3.0)
+    found = deviation.of_twist(root @ root.T, points, centre, 0.02, 0.001)
+    for at, deviation_m in zip(points, found, strict=True):
+        moves = np.hstack([-pose.hat(at - centre), np.eye(3)]) @ root
+        own_sq = 0.02**2 + (0.001 * np.linalg.norm(at)) ** 2
+        np.testing.assert_allclose(deviation_m**2, (moves**2).sum() + own_sq, rtol=1e-9)
+
+
+def check_all_tiny() -> None:
+    """Every comparison on tiny inputs, for interpreted kernels."""
+    check_cells(40)
+    check_no_cells()
+    check_lanes(20)
+    check_deviation(5)
+
+
+def test_cells():
+    check_cells(2000)
+    check_no_cells()
+
+
+def test_lanes():
+    for count in (0, 1, lanes.WIDTH, 100):
+        check_lanes(count)
+
+
+def test_deviation():
+    check_deviation(200)
+
+
+def test_blocks_are_plain_python_underneath():
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import test_blocks; test_blocks.check_all_tiny()"],
+        cwd=Path(__file__).parent, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
