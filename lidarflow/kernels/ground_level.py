@@ -326,6 +326,10 @@ def _take(ground, column, low, high, x, y, near_sq, near_heights):
     if low >= high:
         return
     last, base = len(near_sq) - 1, column * ground.lowest.shape[1]
+    off_x = _outside(x, ground.first[0] + column, ground.first[0] + column + 1, ground.cell_m)
+    off_y = _outside(y, ground.first[1] + low, ground.first[1] + high, ground.cell_m)
+    if off_x * off_x + off_y * off_y > near_sq[last]:
+        return
     for i in range(ground.starts[base + low], ground.starts[base + high]):
         dx, dy, height = ground.points[i, 0] - x, ground.points[i, 1] - y, ground.points[i, 2]
         apart_sq = dx * dx + dy * dy
@@ -336,6 +340,12 @@ def _take(ground, column, low, high, x, y, near_sq, near_heights):
             near_sq[k], near_heights[k] = near_sq[k - 1], near_heights[k - 1]
             k -= 1
         near_sq[k], near_heights[k] = apart_sq, height
+
+
+@njit(inline="always")
+def _outside(place, low, high, cell_m):
+    """How far a place lies outside of the cells low..high along an axis, 0 inside."""
+    return max(max(low * cell_m - place, place - high * cell_m), 0.0)
 
 
 @njit(inline="always")
