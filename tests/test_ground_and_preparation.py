@@ -79,9 +79,10 @@ def yard(height_m: float, ring_step_deg: float = 1.0) -> np.ndarray:
 @pytest.mark.parametrize("height_m", [0.6, 1.0, 1.73, 2.5, 3.5])
 def test_the_sensor_height_is_estimated(height_m):
     points = yard(height_m)
-    assert ground.estimate_sensor_height(points) == pytest.approx(height_m, abs=0.1)
+    rows = np.arange(len(points))
+    assert ground.estimate_sensor_height(points, rows) == pytest.approx(height_m, abs=0.1)
     on_ground = points + [0, 0, height_m]
-    assert ground.estimate_sensor_height(on_ground) == pytest.approx(0.0, abs=0.1)
+    assert ground.estimate_sensor_height(on_ground, rows) == pytest.approx(0.0, abs=0.1)
 
 
 @pytest.mark.parametrize("height_m", [0.6, 1.73, 2.5])
@@ -114,8 +115,10 @@ def test_clouds_too_small_or_too_far_have_no_ground():
                          (flat + [200.0, 0, 0], np.ones(1000, bool))):
         found = ground.detect(points, rows, CONFIG).mask
         assert found.shape == (len(points),) and not found.any()
-    assert ground.estimate_sensor_height(np.empty((0, 3))) is None
-    assert ground.estimate_sensor_height(flat + [200.0, 0, 0]) is None
+    assert ground.estimate_sensor_height(np.empty((0, 3)), np.arange(0)) is None
+    assert ground.estimate_sensor_height(flat + [200.0, 0, 0], np.arange(1000)) is None
+    given = GroundConfig(sensor_height_m=1.7)     # Patchwork++ finds nothing so far away
+    assert not ground.detect(flat + [200.0, 0, 0], np.ones(1000, bool), given).mask.any()
 
 
 def test_nothing_is_printed(capfd):

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -351,30 +352,75 @@ def check_registration_equations(count: int) -> None:
         assert found[2] == paired.sum() > 0
 
 
-def check_ground_level(count: int) -> None:
-    ground, places = rng(40).uniform(-3, 3, (count, 3)), rng(41).uniform(-4, 4, (count, 3))
+def check_ground_level(ground: np.ndarray, places: np.ndarray) -> None:
+    """Heights of sloping ground (G, 3) around places (K, 3); which of them lie within 0.1 m of it."""
+    points = np.vstack([places, ground])
+    rows, ground_rows = np.arange(len(places))[::-1], len(places) + np.arange(len(ground))
+    off = places[rows, None, :2] - ground[None, :, :2]
+    apart_sq = off[..., 0] ** 2 + off[..., 1] ** 2
     for count_near, reach_m in ((1, np.inf), (8, 1.2), (5, 0.8)):
-        flat = ground_level.flat(ground)
-        found = ground_level.around(flat, places, count_near, reach_m)
-        apart = cdist(places[:, :2], ground[:, :2])
-        nearest = np.argsort(apart, axis=1)[:, :count_near]
-        expected = np.median(ground[nearest, 2], axis=1)
-        expected[np.sort(apart, axis=1)[:, count_near - 1] >= reach_m] = np.nan
+        expected = np.full(len(rows), np.nan)
+        for k in range(len(rows)):
+            nearest = np.lexsort((ground[:, 2], apart_sq[k]))[:count_near]
+            if apart_sq[k, nearest[-1]] < reach_m * reach_m:
+                expected[k] = np.median(ground[nearest, 2])
+        flat = ground_level.flat(points, ground_rows, min(reach_m, 2.0))
+        found = ground_level.around(flat, points, rows, count_near, reach_m)
         np.testing.assert_allclose(found, expected, rtol=1e-12)
-        close = np.abs(places[:, 2] - ground_level.around(flat, places, count_near, reach_m, 0.7)) <= 0.7
-        np.testing.assert_array_equal(close, np.abs(places[:, 2] - expected) <= 0.7)
+        if np.isfinite(reach_m):
+            level = ground_level.is_level(flat, points, rows, count_near, 0.1)
+            np.testing.assert_array_equal(level, np.abs(places[rows, 2] - expected) <= 0.1)
+            assert 0 < level.sum() < len(level) - np.isnan(expected).sum()
 
 
-def check_low_per_cell(count: int) -> None:
-    points = rng(42).uniform(-3, 3, (count, 3))
+def ground_and_places(count: int, seed: int, width_m: float, step_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """A slope with a curb (count, 3), and places (count, 3) in, over, under and beside it.
+
+    All are where rows and columns of `step_m` cross, or anywhere where that is 0.
+    """
+    random = rng(seed)
+    both = random.uniform(-width_m, width_m, (2 * count, 3)) * random.choice([0.2, 1.0], (2 * count, 1))
+    if step_m:
+        both[:, :2] = np.round(both[:, :2] / step_m) * step_m
+    ground, places = both[:count], both[count:] + [0.3, 0, 0]
+    ground[:, 2] = 0.05 * ground[:, 0] + 0.4 * (ground[:, 1] > 0) + random.normal(0, 0.03, count)
+    over_m = random.choice([-1.0, 0.0, 0.4, 1.0], count) + random.normal(0, 0.1, count)
+    places[:, 2] = 0.05 * places[:, 0] + over_m
+    places[0] = [20 * width_m, -7 * width_m, 0.0]
+    return ground, places
+
+
+def check_lowest_per_cell(count: int) -> None:
+    points, rows = rng(42).uniform(-5, 5, (count, 3)), np.arange(0, count, 2)
+    lowest, counts = ground_level.lowest_per_cell(points, rows, 3.0, 1.5)
+    near = points[rows][np.hypot(*points[rows, :2].T) < 3.0]
+    cells, own = np.unique(np.floor(near[:, :2] / 1.5), axis=0, return_inverse=True)
+    expected = [near[own.ravel() == cell, 2].min() for cell in range(len(cells))]
+    np.testing.assert_array_equal(np.sort(lowest[counts > 0]), np.sort(expected))
+    np.testing.assert_array_equal(np.sort(counts[counts > 0]), np.sort(np.bincount(own.ravel())))
+    assert np.isinf(lowest[counts == 0]).all()
+
+
+def check_is_low(count: int) -> None:
+    points, rows = rng(43).uniform(-3, 3, (count, 3)), np.arange(0, count, 2)
+    points[:, 2] *= np.where(points[:, 0] < 0, 0.1, 1.0)     # cells of half of it are low altogether
+    own = points[rows]
+    same = (np.floor(own[:, None, :2] / 1.5) == np.floor(own[None, :, :2] / 1.5)).all(axis=2)
     for share in (0.0, 0.3):
-        low, counts, cell = ground_level.low_per_cell(points, 1.5, share)
-        assert counts.sum() == count
-        for number in range(len(counts)):
-            own = points[cell == number]
-            assert len(own) == counts[number]
-            assert len(np.unique(np.floor(own[:, :2] / 1.5), axis=0)) == 1
-            assert low[number] == np.sort(own[:, 2])[int(share * (len(own) - 1))]
+        heights = [np.sort(own[cell, 2]) for cell in same]
+        low = np.array([height[int(share * (len(height) - 1))] for height in heights])
+        found = ground_level.is_low(points, rows, 1.5, share, 0.7)
+        np.testing.assert_array_equal(found, own[:, 2] - low <= 0.7)
+        assert 0 < found.sum() < len(found)
+
+
+def check_lifted(count: int) -> None:
+    points, rows = rng(44).uniform(-50, 50, (count, 3)), np.arange(0, count, 3)
+    expected = np.hstack([points[rows], np.zeros((len(rows), 1))]).astype(np.float32)
+    expected[:, 2] += 0.3
+    found = ground_level.lifted(points, rows, 0.3)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, expected)
 
 
 def check_all_tiny() -> None:
@@ -393,16 +439,32 @@ def check_all_tiny() -> None:
     check_onto_planes(20, 20)
     check_solve_positive4(2)
     check_registration_equations(40)
-    check_ground_level(60)
-    check_low_per_cell(40)
+    check_ground_level(*ground_and_places(120, 40, 2.0, 0.0))
+    check_ground_level(*ground_and_places(120, 41, 2.0, 0.25))
+    check_lowest_per_cell(40)
+    check_is_low(60)
+    check_lifted(40)
 
 
-def test_ground_level():
-    check_ground_level(900)
+@pytest.mark.parametrize("width_m", [1.0, 4.0, 20.0])
+@pytest.mark.parametrize("step_m", [0.0, 0.25])
+def test_ground_level(width_m, step_m):
+    """Cells with many points and with few; places anywhere and equally far from several points."""
+    check_ground_level(*ground_and_places(2500, 40, width_m, step_m))
 
 
-def test_low_per_cell():
-    check_low_per_cell(700)
+def test_the_order_of_ground_points_does_not_matter():
+    ground, places = ground_and_places(900, 45, 4.0, 0.25)
+    points, rows = np.vstack([places, ground]), np.arange(900)
+    found = [ground_level.around(ground_level.flat(points, order, 2.0), points, rows, 8, 2.0)
+             for order in (900 + rows, 900 + rng(46).permutation(900))]
+    np.testing.assert_array_equal(*found)
+
+
+def test_points_of_cells():
+    check_lowest_per_cell(700)
+    check_is_low(700)
+    check_lifted(700)
 
 
 def test_registration_equations():

@@ -9,11 +9,12 @@ from lidarflow.kernels import ground_level
 from lidarflow.silence import silenced
 
 _PATCHWORK_HEIGHT_M = 1.723   # the height Patchwork++ is tuned for; clouds are shifted to it
+_PATCHWORK_MIN_RANGE_M = 1.0
+_PATCHWORK_MAX_RANGE_M = 80.0   # bounds the area that cells are laid over
 _CELL_M = 2.0
 _NEAR_M = 20.0
 _MIN_CELL_POINTS = 5
 _MIN_CLOUD_POINTS = 50
-_PATCHWORK_MIN_RANGE_M = 1.0
 _LOW_SHARE = 0.1
 _REFLECTION_DEPTH_M = 0.5
 _FILL_NEIGHBOURS = 8
@@ -43,60 +44,50 @@ def detect(points: np.ndarray, kept: np.ndarray, config: GroundConfig) -> Ground
     rows = np.flatnonzero(kept)
     if len(rows) < _MIN_CLOUD_POINTS:
         return Ground.none(len(points))
-    height_m = config.sensor_height_m or estimate_sensor_height(points[rows])
+    height_m = config.sensor_height_m or estimate_sensor_height(points, rows)
     if height_m is None:
         return Ground.none(len(points))
-    shifted = points[rows].astype(np.float32)
-    shifted[:, 2] += height_m - _PATCHWORK_HEIGHT_M
-    found = rows[_patchwork(shifted)]
-    found = found[_close_to_local_ground(points[found], config.max_height_m)]
+    found = rows[_patchwork(ground_level.lifted(points, rows, height_m - _PATCHWORK_HEIGHT_M))]
     if len(found) == 0:
         return Ground.none(len(points))
+    found = found[_close_to_local_ground(points, found, config.max_height_m)]
     ground = Ground.none(len(points))
     ground.mask[found] = True
-    around = ground_level.flat(points[found])
+    around = ground_level.flat(points, found, _FILL_RADIUS_M)
     others = rows[~ground.mask[rows]]
-    ground.mask[others] = _in_the_plane_around(points[others], around, config.fill_height_m)
-    low = rows[~ground.mask[rows] & (points[rows, 2] < np.median(points[found, 2]) - _REFLECTION_DEPTH_M)]
-    level = ground_level.around(around, points[low], 1, np.inf)
+    # Patchwork++ judges whole patches and now and then drops one in the middle of the road; its points lie on
+    # rings that travel with the sensor and would pass for a moving object.
+    is_filled = ground_level.is_level(around, points, others, _FILL_NEIGHBOURS, config.fill_height_m)
+    ground.mask[others[is_filled]] = True
+    others = others[~is_filled]
+    low = others[points[others, 2] < np.median(around.points[:, 2]) - _REFLECTION_DEPTH_M]
+    level = ground_level.around(around, points, low, 1, np.inf)
     ground.reflection[low] = points[low, 2] < level - _REFLECTION_DEPTH_M
     return ground
 
 
-def estimate_sensor_height(points: np.ndarray) -> float | None:
-    """Height in metres of the origin over the ground around it, None for a cloud without near points.
+def estimate_sensor_height(points: np.ndarray, rows: np.ndarray) -> float | None:
+    """Height in metres of the origin over the ground around it, None without near points.
 
-    The lowest points of cells around the sensor are ground where ground is seen; the lower quartile of
-    those leaves out cells that only show walls.
+    Of the `rows` of points (N, 3). The lowest points of cells around the sensor are ground where ground is
+    seen; the lower quartile of those leaves out cells that only show walls.
     """
-    near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR_M]
-    lowest, counts, _ = ground_level.low_per_cell(near, _CELL_M, 0.0)
+    lowest, counts = ground_level.lowest_per_cell(points, rows, _NEAR_M, _CELL_M)
     trusted = lowest[counts >= _MIN_CELL_POINTS]
     return float(-np.quantile(trusted, 0.25)) if len(trusted) else None
 
 
-def _close_to_local_ground(points: np.ndarray, max_height_m: float) -> np.ndarray:
-    """Mask (N,) of the points at most `max_height_m` over the low ground of their cell.
+def _close_to_local_ground(points: np.ndarray, rows: np.ndarray, max_height_m: float) -> np.ndarray:
+    """Mask (K,) of the rows (K,) of points at most `max_height_m` over the low ground of their cell.
 
     A low quantile, not the lowest point, which may be a reflection from under the road.
     """
-    low, _, cell = ground_level.low_per_cell(points, _CELL_M, _LOW_SHARE)
     slope_allowance_m = 0.1 * _CELL_M
-    return points[:, 2] - low[cell] <= max_height_m + slope_allowance_m
-
-
-def _in_the_plane_around(points: np.ndarray, ground: ground_level.Flat, height_m: float) -> np.ndarray:
-    """Mask (N,) of the points that lie within `height_m` of the ground around them.
-
-    Patchwork++ judges whole patches and now and then drops one in the middle of the road; its points lie on
-    rings that travel with the sensor and would pass for a moving object.
-    """
-    level = ground_level.around(ground, points, _FILL_NEIGHBOURS, _FILL_RADIUS_M, height_m)
-    return np.abs(points[:, 2] - level) <= height_m   # not where the level is NaN
+    return ground_level.is_low(points, rows, _CELL_M, _LOW_SHARE, max_height_m + slope_allowance_m)
 
 
 def _patchwork(points: np.ndarray) -> np.ndarray:
-    """Row numbers of the ground in points (N, 3) float32 of a sensor at Patchwork++'s own height."""
+    """Row numbers of the ground in points (N, 4) float32, x y z 0, of a sensor at Patchwork++'s height."""
     import pypatchworkpp
 
     parameters = pypatchworkpp.Parameters()
@@ -104,7 +95,8 @@ def _patchwork(points: np.ndarray) -> np.ndarray:
     parameters.enable_RNR = False   # noise removal by intensity: clouds here need not have any
     parameters.sensor_height = _PATCHWORK_HEIGHT_M
     parameters.min_range = _PATCHWORK_MIN_RANGE_M
+    parameters.max_range = _PATCHWORK_MAX_RANGE_M
     with silenced(1):   # it greets, whatever `verbose` says
         estimator = pypatchworkpp.patchworkpp(parameters)
-    estimator.estimateGround(np.column_stack([points, np.zeros(len(points), np.float32)]))
+    estimator.estimateGround(points)
     return np.asarray(estimator.getGroundIndices(), np.int64)
