@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from lidarflow.kernels import grid, ground_plane, icp, links, misfit, neighbours
+from lidarflow.kernels import grid, ground_plane, icp, links, misfit, neighbours, queue
 from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import moved
@@ -69,7 +69,14 @@ class Fit(NamedTuple):
     point_weight: float
 
 
-@njit(parallel=True)
+class _Nearest(NamedTuple):
+    """Which place of the target each row is nearest to, as icp.follow keeps it from round to round."""
+
+    place: np.ndarray
+    asked: np.ndarray
+    clear_m: np.ndarray
+
+
 def grow_each(
     seeds, bounds, starts, free, source, own, target, target_normals, ground, limits, fit, gates_m
 ):
@@ -79,30 +86,42 @@ def grow_each(
     `free` (N,) are taken. One that stays too small takes none. `source` is the tree over `own`, the others
     are of the surface that bodies move onto and of its ground.
     """
-    did = np.zeros((len(starts), len(own.points)), np.uint8)
-    motions = starts.copy()
-    for h in numba.prange(len(starts)):
-        _grow(seeds[bounds[h]: bounds[h + 1]], free, source, own, target, target_normals, ground, limits, fit,
-              gates_m, did[h], motions[h])
+    did, motions = np.zeros((len(starts), len(own.points)), np.uint8), starts.copy()
+    threads = min(numba.get_num_threads(), len(starts))
+    _grow_each(seeds, bounds, queue.tasks(), threads, free, source, own, target, target_normals, ground,
+               limits, fit, gates_m, did, motions)
     return did, motions
+
+
+@njit(parallel=True)
+def _grow_each(
+    seeds, bounds, waiting, threads, free, source, own, target, target_normals, ground, limits, fit, gates_m,
+    did, motions
+):
+    """Each thread takes the next growth when it has done one: they differ in size, and it changes nothing."""
+    count = len(own.points)
+    for _ in numba.prange(threads):
+        nearest = _Nearest(np.empty(count, np.int64), np.empty((count, 3)), np.empty(count))
+        h = queue.take(waiting)
+        while h < len(motions):
+            _grow(seeds[bounds[h]: bounds[h + 1]], free, source, own, target, target_normals, ground, limits,
+                  fit, gates_m, nearest, did[h], motions[h])
+            h = queue.take(waiting)
 
 
 @njit()
 def _grow(
-    seed, free, source, own, target, target_normals, ground, limits, fit, gates_m, did, motion
+    seed, free, source, own, target, target_normals, ground, limits, fit, gates_m, nearest, did, motion
 ):
     is_seed = np.zeros(len(did), np.bool_)
     is_seed[seed] = True
-    rows, reach_m = seed, limits.first_reach_m
-    asked = 0
+    near, rows, reach_m = np.empty(0, np.int64), seed, limits.first_reach_m
     for _ in range(limits.rounds):
-        for row in neighbours.rows_near(source, trees.grown(own.points[rows]), reach_m):
-            did[row] = ASKED
-        near = np.flatnonzero(did)
-        if len(near) == asked:
+        new = _newly_asked(neighbours.rows_near(source, trees.grown(own.points[rows]), reach_m), did, nearest)
+        if len(new) == 0:
             break
-        asked, reach_m = len(near), limits.reach_m
-        rows = _agreeing(near, free, motion, own, target, target_normals, ground, limits)
+        near, reach_m = np.sort(np.concatenate((near, new))), limits.reach_m
+        rows = _agreeing(near, free, motion, own, target, target_normals, ground, limits, nearest)
         if len(rows) >= limits.min_points:
             rows = _hanging_together(rows, own.points, is_seed, limits.link_m)
         if len(rows) < limits.min_points:
@@ -112,7 +131,20 @@ def _grow(
 
 
 @njit()
-def _agreeing(near, free, motion, own, target, target_normals, ground, limits):
+def _newly_asked(rows, did, nearest):
+    """Those of the rows that were not asked before; they are from now on."""
+    new, count = np.empty(len(rows), np.int64), 0
+    for row in rows:
+        if did[row] == 0:
+            did[row] = ASKED
+            nearest.place[row], nearest.clear_m[row] = -1, -np.inf
+            new[count] = row
+            count += 1
+    return new[:count]
+
+
+@njit()
+def _agreeing(near, free, motion, own, target, target_normals, ground, limits, nearest):
     """The free ones of the rows that the motion explains clearly better, or in place and about as well."""
     rows, count = np.empty(len(near), np.int64), 0
     better_m, as_good_m = limits.clearly_better_m, limits.as_good_m
@@ -120,8 +152,11 @@ def _agreeing(near, free, motion, own, target, target_normals, ground, limits):
         if not free[row]:
             continue
         ego_m, ego_plane_m = own.by_ego_m[row], own.by_ego_plane_m[row]
-        own_m, plane_m = misfit.after_one(
-            own.points[row], own.normals[row], motion, target, target_normals, ground, limits.cap_m,
+        x, y, z = moved(own.points[row], motion)
+        place, apart_sq = icp.follow(
+            target, x, y, z, 2.0 * limits.cap_m, row, nearest.place, nearest.asked, nearest.clear_m)
+        own_m, plane_m = misfit.beyond_nearest(
+            x, y, z, place, apart_sq, own.normals[row], motion, target, target_normals, ground, limits.cap_m,
             limits.min_agreement)
         fits = own_m <= own.tolerance_m[row]
         better = own_m < ego_m - better_m

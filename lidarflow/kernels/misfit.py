@@ -80,6 +80,15 @@ def after_one(point, normal, motion, target, target_normals, beside, cap_m, min_
     """As `after`, of one point (3,) with a normal (3,): its distance and its plane distance."""
     x, y, z = moved(point, motion)
     place, apart_sq = trees.nearest(target, x, y, z, 4.0 * cap_m * cap_m, -1)
+    return beyond_nearest(x, y, z, place, apart_sq, normal, motion, target, target_normals, beside, cap_m,
+                          min_agreement)
+
+
+@njit()
+def beyond_nearest(
+    x, y, z, place, apart_sq, normal, motion, target, target_normals, beside, cap_m, min_agreement
+):
+    """As `after_one`, of a point moved to x, y, z whose nearest place in `target` is known, -1 = none."""
     _, nearest_sq = trees.nearest(beside, x, y, z, min(apart_sq, cap_m * cap_m), -1)
     distance_m = math.sqrt(nearest_sq)
     if place >= 0:
