@@ -137,7 +137,7 @@ def _newly_asked(rows, did, nearest):
     for row in rows:
         if did[row] == 0:
             did[row] = ASKED
-            nearest.place[row], nearest.clear_m[row] = -1, -np.inf
+            nearest.place[row], nearest.asked[row], nearest.clear_m[row] = -1, 0.0, -np.inf
             new[count] = row
             count += 1
     return new[:count]
