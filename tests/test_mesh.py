@@ -11,7 +11,7 @@ from lidarflow.config import Config, MeshConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.errors import DataError
 from lidarflow.kernels import grid
-from lidarflow.lidar import ground, mesh, preparation, rings
+from lidarflow.lidar import frontend, ground, mesh, preparation, rings
 from lidarflow.synthetic import Part, Scene, shapes
 
 CONFIG = Config()
@@ -274,6 +274,22 @@ def test_no_edge_is_longer_or_jumps_farther_than_allowed(street_scan, method):
     assert (jump_m <= CONFIG.mesh.max_depth_jump_m + 1e-9).all()
     sine_sq = np.sin(np.radians(CONFIG.mesh.min_grazing_deg)) ** 2
     assert (length_m**2 - jump_m**2 >= sine_sq * length_m**2 - 1e-9).all()
+
+
+@pytest.mark.parametrize("thinning_m", [0.0, 0.5])
+def test_the_graph_of_a_mesh_has_its_points_edges_and_components(street_scan, thinning_m):
+    found = built(street_scan, street_scan[:, 2] > -1.5)
+    graph = frontend.build(street_scan, found, thinning_m)
+    problem = graph.problem
+    np.testing.assert_array_equal(np.flatnonzero(graph.variable >= 0), np.unique(found.edges))
+    np.testing.assert_array_equal(problem.points, street_scan[graph.rows])
+    between = np.sort(graph.variable[found.edges], axis=1)
+    between = np.unique(between[between[:, 0] != between[:, 1]], axis=0)
+    np.testing.assert_array_equal(problem.edges, between)
+    _, component = np.unique(found.component[graph.rows], return_inverse=True)
+    np.testing.assert_array_equal(problem.component, component)
+    assert {problem.edges.dtype, problem.component.dtype, graph.variable.dtype} == {np.dtype(np.int32)}
+    assert (problem.initial == pose.identity()).all() and len(problem.initial) == len(graph.rows)
 
 
 def test_only_points_that_are_kept_are_meshed():
