@@ -6,14 +6,25 @@ Every check takes a size, so that the same comparison also runs with compilation
 import os
 import subprocess
 import sys
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from lidarflow.kernels import coherence, graphs, grid, linalg, matching, mesh, normals, shot, tangent_stars
+from lidarflow.kernels import (
+    coherence,
+    graphs,
+    grid,
+    linalg,
+    matching,
+    mesh,
+    normals,
+    rings,
+    shot,
+    tangent_stars,
+)
 
 RADIUS_M = 1.0
 
@@ -297,38 +308,127 @@ def check_matching(count: int) -> None:
 
 # ---- mesh -----------------------------------------------------------------------------------------------
 
-def check_ring_strips(rings: int, columns: int) -> None:
+def check_ring_basics(count: int) -> None:
+    random = rng(14)
+    points = random.normal(size=(count, 3)) * random.choice([0.01, 1.0], (count, 1))
+    points[::7] = [[np.nan, 1.0, 1.0]]
+    points[::11] = [[1.0, 1.0, -np.inf]]
+    expected = [bool(np.isfinite(point).all() and np.linalg.norm(point) > 0.1) for point in points]
+    np.testing.assert_array_equal(rings.usable(points, 0.1), expected)
+
+    azimuth = (np.cumsum(random.normal(0.4, 0.5, count)) + np.pi) % (2 * np.pi) - np.pi
+    turn = 2 * np.pi
+    for angles in (azimuth, azimuth[::-1].copy()):
+        np.testing.assert_array_equal(rings.steps(angles), (np.diff(angles) + np.pi) % turn - np.pi)
+    for direction in (1.0, -1.0):
+        turned = (direction * (azimuth - azimuth[0]) + 0.1) % turn
+        expected = np.flatnonzero(np.diff(turned) < -1.0) + 1
+        assert 0 < len(expected) < (np.diff(turned) < 0).sum()
+        np.testing.assert_array_equal(rings.cuts(azimuth, direction, 0.1, 1.0), expected)
+
+    bounds = np.array([0, 1, count // 2, count])
+    ranks = np.array([[0, 0], [1, count // 2 - 1], [count // 2 + 3, count // 2 + 3]])
+    runs = np.split(azimuth, bounds[1:-1])
+    expected = [np.sort(run)[rank - first] for run, rank, first in zip(runs, ranks, bounds, strict=False)]
+    np.testing.assert_array_equal(rings.at_ranks(azimuth, bounds, ranks), expected)
+
+
+def check_ring_strips(levels: int, columns: int) -> None:
     """A band of a cylinder: all of its strips, nothing else; also where azimuth wraps around."""
     limits = (0.9, 0.0, 1.0, np.radians(4.0))
     azimuth = (np.arange(columns) + 0.3) * (2 * np.pi / columns) - np.pi
-    angle, level = np.tile(azimuth, rings), np.repeat(np.arange(rings), columns)
+    angle, level = np.tile(azimuth, levels), np.repeat(np.arange(levels), columns)
     points = np.column_stack([5 * np.cos(angle), 5 * np.sin(angle), 0.5 * level])
-    order, bounds = np.arange(len(points)), np.arange(rings + 1) * columns
+    bounds, all_wanted = np.arange(levels + 1) * columns, np.ones(len(points), bool)
     assert 5 * 2 * np.pi / columns < 0.7, "columns must be close enough to be joined"
-    around = mesh.ring_strips(points, angle, order, bounds, *limits)
-    assert len(around) == 2 * (rings - 1) * columns
+    grid_all_round = mesh.scan_grid(points, angle, np.arange(len(points)), bounds)
+    around = mesh.ring_strips(grid_all_round, 1, all_wanted, *limits)
+    assert len(around) == 2 * (levels - 1) * columns
     assert len(np.unique(np.sort(around, axis=1), axis=0)) == len(around)
     assert (np.ptp(level[around], axis=1) == 1).all()
     column_steps = (around % columns - around[:, :1] % columns + 1) % columns
     assert (column_steps <= 2).all()
 
     gap = (angle > 0.5) & (angle < 1.5)
-    rows = np.flatnonzero(~gap)
-    bounds = np.searchsorted(level[rows], np.arange(rings + 1))
-    opened = mesh.ring_strips(points, angle, rows, bounds, *limits)
+    opened = mesh.ring_strips(mesh.part(grid_all_round, ~gap), 1, all_wanted, *limits)
     assert not gap[opened].any()
-    missing = 2 * (rings - 1) * (gap.sum() // rings + 1)
+    missing = 2 * (levels - 1) * (gap.sum() // levels + 1)
     assert len(opened) == len(around) - missing
     for i, j in ((0, 1), (1, 2), (0, 2)):
         assert np.linalg.norm(points[opened[:, i]] - points[opened[:, j]], axis=1).max() <= 0.9
 
 
+def continuous_twin(a, b, max_edge_m, max_edge_rad, max_depth_jump_m, min_grazing_rad) -> bool:
+    length, ranges_m = np.linalg.norm(b - a), np.linalg.norm([a, b], axis=1)
+    jump = abs(ranges_m[1] - ranges_m[0])
+    across = np.sqrt(max(length**2 - jump**2, 0.0))
+    is_short = length <= max(max_edge_m, max_edge_rad * ranges_m.min())
+    return is_short and jump <= max_depth_jump_m and across >= np.sin(min_grazing_rad) * length
+
+
+def strips_twin(points, azimuth, rows_of_rings, step, wanted, limits) -> list[tuple[int, int, int]]:
+    """Rings are walked in the order of all their points' azimuths, the upper of two equal ones first."""
+    triangles = []
+    for pair in (pair for first in range(step) for pair in pairwise(rows_of_rings[first::step])):
+        if not all(pair):
+            continue
+        walk = [(azimuth[row], side, row) for side, ring in enumerate(pair) for row in ring[1:]]
+        walk += [(azimuth[ring[0]] + 2 * np.pi, side, ring[0]) for side, ring in enumerate(pair)
+                 if azimuth[ring[0]] + np.pi < azimuth[ring[-1]]]
+        last = [pair[0][0], pair[1][0]]
+        for _, side, row in sorted(walk):
+            corners = (*last, row)
+            if wanted[list(corners)].any() and all(
+                    continuous_twin(points[a], points[b], *limits) for a, b in combinations(corners, 2)):
+                triangles.append(corners)
+            last[side] = row
+    return triangles
+
+
+def check_strips_and_edges(levels: int, columns: int) -> None:
+    """A ragged surface against walks along pairs of rings.
+
+    Where it is thinned, one ring ends before the half turn behind, one has less of a gap there, one is empty.
+    """
+    random = rng(9)
+    azimuth = random.uniform(-np.pi, np.pi, levels * columns).round(2)
+    ring = np.repeat(np.arange(levels), columns)
+    range_m = 4.0 + 2.0 * (azimuth > 1.0) + random.normal(0, 0.2, len(azimuth))
+    points = range_m[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth), 0.08 * ring])
+    in_fragment = random.random(len(points)) < 0.2
+    order = np.lexsort((azimuth, ring))
+    whole = mesh.scan_grid(points, azimuth, order, np.arange(levels + 1) * columns)
+    behind = np.abs(azimuth[order])
+    kept = (random.random(len(points)) < 0.8) & (ring[order] != 2)
+    kept &= ~((ring[order] == 0) & (behind > 1.4)) & ~((ring[order] == 1) & (behind > 2.2))
+    some = mesh.part(whole, kept)
+    surface, anything = (0.9, 0.2, 0.5, np.radians(10.0)), (20.0, 0.0, 10.0, 0.01)
+    for one, limits in ((whole, surface), (some, surface), (some, anything)):
+        chosen = order if one is whole else order[kept]
+        np.testing.assert_array_equal(one.row, chosen)
+        rows_of_rings = [chosen[ring[chosen] == level].tolist() for level in range(levels)]
+        for step, wanted in ((1, np.ones(len(points), bool)), (1, in_fragment), (2, in_fragment)):
+            expected = strips_twin(points, azimuth, rows_of_rings, step, wanted, limits)
+            found = mesh.ring_strips(one, step, wanted[one.row], *limits)
+            assert 0 < len(expected) < len(chosen) * 2
+            np.testing.assert_array_equal(found, expected)
+        expected = [sorted(pair) for rows in rows_of_rings for pair in pairwise(rows)
+                    if in_fragment[list(pair)].any() and continuous_twin(*points[list(pair)], *limits)]
+        np.testing.assert_array_equal(mesh.ring_edges(one, in_fragment[one.row], *limits), expected)
+
+
 def check_graphs(count: int) -> None:
     triangles = np.array([rng(k).choice(count, 3, replace=False) for k in range(count // 2)], np.int32)
-    edges = graphs.sides(triangles, count)
-    wanted = {(min(a, b), max(a, b)) for t in triangles.tolist()
-              for a, b in ((t[0], t[1]), (t[1], t[2]), (t[0], t[2]))}
+    triangles[1::2, 0], triangles[1::2, 1] = triangles[::2, 2][: count // 4], triangles[::2, 1][: count // 4]
+    triangles[2::4, 0] = triangles[1::4, 2][: len(triangles[2::4])]     # a corner alone makes no strip
+    more = np.array([[0, count - 1], [count - 1, 1], *triangles[:2, 1:]], np.int32)
+    edges = graphs.sides(triangles, more, count)
+    both = [*triangles.tolist(), *more.tolist()]
+    wanted = {(min(pair), max(pair)) for corners in both for pair in combinations(corners, 2)}
     assert list(map(tuple, edges.tolist())) == sorted(wanted)
+    among = [row in set(triangles.ravel().tolist()) for row in range(count)]
+    assert not all(among)
+    np.testing.assert_array_equal(graphs.touched(triangles, count), among)
     few = edges[: len(edges) // 3]
     label = list(range(count))
     for _ in range(count):
@@ -336,26 +436,10 @@ def check_graphs(count: int) -> None:
             label[a] = label[b] = min(label[a], label[b])
     _, expected = np.unique(label, return_inverse=True)
     np.testing.assert_array_equal(graphs.components(few, count), expected)
-    np.testing.assert_array_equal(graphs.components(triangles, count), graphs.components(edges, count))
-    assert len(graphs.sides(triangles[:0], 5)) == 0
+    of_sides = graphs.sides(triangles, more[:0], count)
+    np.testing.assert_array_equal(graphs.components(triangles, count), graphs.components(of_sides, count))
+    assert len(graphs.sides(triangles[:0], more[:0], 5)) == 0
     np.testing.assert_array_equal(graphs.components(edges[:0], 3), [0, 1, 2])
-
-
-def check_ring_edges(count: int) -> None:
-    points = rng(9).uniform(-1, 1, (count, 3)) + [6.0, 0.0, 0.0]
-    ring, wanted = rng(10).integers(0, 3, count), rng(11).random(count) < 0.5
-    order = np.lexsort((np.arctan2(points[:, 1], points[:, 0]), ring))
-    bounds = np.searchsorted(ring[order], np.arange(4))
-    found = mesh.ring_edges(points, order, bounds, wanted, 0.9, 0.0, 0.5, np.radians(10.0))
-    expected = []
-    for a, b in pairwise(order.tolist()):
-        step, reach = points[b] - points[a], np.linalg.norm(points[[a, b]], axis=1)
-        length, jump = np.linalg.norm(step), abs(reach[1] - reach[0])
-        across = np.sqrt(max(length**2 - jump**2, 0.0))
-        joined = length <= 0.9 and jump <= 0.5 and across >= np.sin(np.radians(10.0)) * length
-        if ring[a] == ring[b] and (wanted[a] or wanted[b]) and joined:
-            expected.append(sorted((a, b)))
-    np.testing.assert_array_equal(found, expected)
 
 
 STAR_LIMITS = (0.4, 0.0, 0.36, np.radians(4.0), np.radians(45), np.radians(2), np.radians(120))
@@ -385,7 +469,8 @@ def check_all_tiny() -> None:
     check_shot(160, 4)
     check_matching(40)
     check_ring_strips(3, 60)
-    check_ring_edges(60)
+    check_strips_and_edges(5, 40)
+    check_ring_basics(60)
     check_graphs(30)
     check_tangent_stars(150)
 
@@ -479,8 +564,12 @@ def test_graphs():
     check_graphs(120)
 
 
-def test_ring_edges():
-    check_ring_edges(400)
+def test_ring_strips_and_edges_of_a_ragged_surface():
+    check_strips_and_edges(7, 60)
+
+
+def test_ring_basics():
+    check_ring_basics(500)
 
 
 def test_tangent_stars():

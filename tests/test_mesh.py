@@ -11,7 +11,7 @@ from lidarflow.config import Config, MeshConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.errors import DataError
 from lidarflow.kernels import grid
-from lidarflow.lidar import ground, mesh, preparation, rings
+from lidarflow.lidar import frontend, ground, mesh, preparation, rings
 from lidarflow.synthetic import Part, Scene, shapes
 
 CONFIG = Config()
@@ -57,7 +57,17 @@ def test_rings_come_back_exactly_from_file_order(make, yaw, is_clockwise):
     points = turned(ball_of_walls(sensor), yaw)
     if is_clockwise:
         points = points * [1, -1, 1]
-    np.testing.assert_array_equal(rings.recover(points), ring_of(points, sensor))
+    np.testing.assert_array_equal(rings.recover(points).index, ring_of(points, sensor))
+
+
+@pytest.mark.parametrize("drop", [0.0, 0.2])
+def test_rings_know_their_azimuths_and_the_median_angle_between_them(street_scan, drop):
+    points = street_scan[rng(15).random(len(street_scan)) >= drop]
+    found = rings.recover(points)
+    np.testing.assert_array_equal(found.azimuth, np.arctan2(points[:, 1], points[:, 0]))
+    pitch = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    middle = [np.median(pitch[found.index == ring]) for ring in range(found.index.max() + 1)]
+    assert found.spacing_rad == np.median(np.abs(np.diff(middle)))
 
 
 def test_file_order_carries_rings_whose_pitch_wanders():
@@ -65,7 +75,7 @@ def test_file_order_carries_rings_whose_pitch_wanders():
     points = ball_of_walls(sensor)
     expected = ring_of(points, sensor)
     wandering = points + np.column_stack([np.zeros((len(points), 2)), rng(1).normal(0, 0.04, len(points))])
-    np.testing.assert_array_equal(rings.recover(wandering), expected)
+    np.testing.assert_array_equal(rings.recover(wandering).index, expected)
     assert rings.recover(wandering[rng(2).permutation(len(points))]) is None
 
 
@@ -74,7 +84,7 @@ def test_rings_come_back_exactly_from_pitch_in_any_order(make):
     sensor = make(columns=400)
     points = ball_of_walls(sensor)
     shuffled = points[rng(3).permutation(len(points))]
-    np.testing.assert_array_equal(rings.recover(shuffled), ring_of(shuffled, sensor))
+    np.testing.assert_array_equal(rings.recover(shuffled).index, ring_of(shuffled, sensor))
 
 
 def test_rows_without_a_point_have_no_ring_and_change_no_other():
@@ -85,7 +95,7 @@ def test_rows_without_a_point_have_no_ring_and_change_no_other():
     holed = points.copy()
     holed[gone] = np.where(rng(5).random(gone.sum()) < 0.5, np.nan, 0.0)[:, None]
     expected[gone] = -1
-    np.testing.assert_array_equal(rings.recover(holed), expected)
+    np.testing.assert_array_equal(rings.recover(holed).index, expected)
 
 
 def test_other_clouds_have_no_rings():
@@ -240,7 +250,7 @@ def test_edges_are_sides_of_triangles_or_along_rings_and_components_follow(stree
     else:
         # The others join points of a ring, at least one of which no triangle has.
         on_triangle = np.isin(edges[~by_side], triangles)
-        ring = rings.recover(street_scan)[edges[~by_side]]
+        ring = rings.recover(street_scan).index[edges[~by_side]]
         assert 0 < len(ring) < 0.05 * len(edges)
         assert (ring[:, 0] == ring[:, 1]).all() and not on_triangle.all(axis=1).any()
 
@@ -264,6 +274,22 @@ def test_no_edge_is_longer_or_jumps_farther_than_allowed(street_scan, method):
     assert (jump_m <= CONFIG.mesh.max_depth_jump_m + 1e-9).all()
     sine_sq = np.sin(np.radians(CONFIG.mesh.min_grazing_deg)) ** 2
     assert (length_m**2 - jump_m**2 >= sine_sq * length_m**2 - 1e-9).all()
+
+
+@pytest.mark.parametrize("thinning_m", [0.0, 0.5])
+def test_the_graph_of_a_mesh_has_its_points_edges_and_components(street_scan, thinning_m):
+    found = built(street_scan, street_scan[:, 2] > -1.5)
+    graph = frontend.build(street_scan, found, thinning_m)
+    problem = graph.problem
+    np.testing.assert_array_equal(np.flatnonzero(graph.variable >= 0), np.unique(found.edges))
+    np.testing.assert_array_equal(problem.points, street_scan[graph.rows])
+    between = np.sort(graph.variable[found.edges], axis=1)
+    between = np.unique(between[between[:, 0] != between[:, 1]], axis=0)
+    np.testing.assert_array_equal(problem.edges, between)
+    _, component = np.unique(found.component[graph.rows], return_inverse=True)
+    np.testing.assert_array_equal(problem.component, component)
+    assert {problem.edges.dtype, problem.component.dtype, graph.variable.dtype} == {np.dtype(np.int32)}
+    assert (problem.initial == pose.identity()).all() and len(problem.initial) == len(graph.rows)
 
 
 def test_only_points_that_are_kept_are_meshed():

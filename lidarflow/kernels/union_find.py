@@ -8,21 +8,23 @@ from lidarflow.kernels.compiled import njit
 @njit()
 def join(parent, a, b):
     """Put a and b into one set; `parent` (N,) begins as 0 .. N-1."""
-    a, b = _root(parent, a), _root(parent, b)
-    parent[max(a, b)] = min(a, b)
+    if parent[a] == parent[b]:   # most pairs tell what is known
+        return
+    a_root, b_root = _root(parent, a), _root(parent, b)
+    root = min(a_root, b_root)
+    parent[a_root] = parent[b_root] = parent[a] = parent[b] = root
 
 
 @njit()
 def labels(parent):
     """Label (N,) of each thing's set, numbered in the order of their first members."""
     label, count = np.empty(len(parent), np.int64), 0
-    for i in range(len(parent)):   # a root is the first of its set
-        root = _root(parent, i)
-        if root == i:
+    for i in range(len(parent)):   # a parent comes before its children, and the root is the first of its set
+        if parent[i] == i:
             label[i] = count
             count += 1
         else:
-            label[i] = label[root]
+            label[i] = label[parent[i]]
     return label
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.config import MatchingConfig
+from lidarflow.kernels import graphs
 from lidarflow.lidar.keypoints import Keypoints
 from lidarflow.lidar.matching import Matches
 from lidarflow.lidar.mesh import Mesh
@@ -37,12 +38,12 @@ def build(points: np.ndarray, mesh: Mesh, thinning_m: float) -> Graph:
     """
     variable, rows = _variables(points, mesh, thinning_m)
     edges = variable[mesh.edges]
-    edges = np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1)
-    edges = np.unique(edges, axis=0).astype(np.int32) if thinning_m else edges.astype(np.int32)
-    _, component = np.unique(mesh.component[rows], return_inverse=True)
+    if thinning_m:
+        edges = np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1)
+        edges = np.unique(edges, axis=0)
     problem = FlowProblem(
-        points[rows], pose.identity(len(rows)), np.empty(0, np.int32), np.empty((0, 3)), edges,
-        component.astype(np.int32))
+        points[rows], np.broadcast_to(pose.identity(), (len(rows), 4, 4)), np.empty(0, np.int32),
+        np.empty((0, 3)), edges, _renumbered(mesh.component[rows]))
     return Graph(problem, variable, rows)
 
 
@@ -111,9 +112,7 @@ def _variables(points: np.ndarray, mesh: Mesh, thinning_m: float) -> tuple[np.nd
 
     With thinning, the points of one component in one voxel share a variable, at the lowest row.
     """
-    meshed = np.zeros(len(points), bool)
-    meshed[mesh.edges.ravel()] = True
-    rows = np.flatnonzero(meshed)
+    rows = np.flatnonzero(graphs.touched(mesh.edges, len(points)))
     variable = np.full(len(points), -1, np.int32)
     if thinning_m == 0 or len(rows) == 0:
         variable[rows] = np.arange(len(rows), dtype=np.int32)
@@ -124,3 +123,10 @@ def _variables(points: np.ndarray, mesh: Mesh, thinning_m: float) -> tuple[np.nd
     rank = np.argsort(np.argsort(first, kind="stable"), kind="stable")
     variable[rows] = rank[member.ravel()]
     return variable, rows[np.sort(first)]
+
+
+def _renumbered(component: np.ndarray) -> np.ndarray:
+    """Components (M,) int32 without gaps between their numbers, in the same order."""
+    is_there = np.zeros(component.max(initial=-1) + 1, bool)
+    is_there[component] = True
+    return (np.cumsum(is_there, dtype=np.int32) - np.int32(1))[component]

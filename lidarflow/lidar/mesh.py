@@ -44,89 +44,61 @@ def build(
     grid (rings × azimuth), every other cloud by local triangulation in tangent planes (after Marton et al.
     2009). Raises DataError when the grid is asked for and the cloud has none.
     """
-    ring = None if config.method == "tangent" else rings.recover(points)
-    if ring is None and config.method == "grid":
+    found = None if config.method == "tangent" else rings.recover(points)
+    if found is None and config.method == "grid":
         raise DataError("mesh.method = grid, but the rings of a spinning sensor cannot be told apart in this "
                         "cloud; use auto or tangent")
-    if ring is None:
+    along = np.empty((0, 2), np.int32)
+    if found is None:
         method = "tangent"
         triangles = _tangent_triangles(points, kept, surface, config, normal_radius_m)
     else:
-        azimuth = np.arctan2(points[:, 1], points[:, 0])
-        order = _by_ring(azimuth, np.flatnonzero(kept & (ring >= 0)), ring)
-        method, triangles = "grid", _grid_triangles(points, azimuth, order, ring, config)
-    edges = graphs.sides(triangles, len(points))
-    if ring is not None:
-        edges = _with_ring_edges(edges, points, order, ring, config)
+        grid = _scan_grid(points, kept, found)
+        method, triangles = "grid", _grid_triangles(grid, len(points), found.spacing_rad, config)
+        along = _ring_edges(grid, graphs.touched(triangles, len(points)), config)
+    edges = graphs.sides(triangles, along, len(points))
     return Mesh(triangles, edges, graphs.components(edges, len(points)), method)
 
 
-def _grid_triangles(
-    points: np.ndarray, azimuth: np.ndarray, order: np.ndarray, ring: np.ndarray, config: MeshConfig
-) -> np.ndarray:
+def _scan_grid(points: np.ndarray, kept: np.ndarray, found: rings.Rings) -> kernel.ScanGrid:
+    """The kept points (N,) that have a ring, along the rings."""
+    rows = np.flatnonzero(kept & (found.index >= 0))
+    ring = found.index[rows]
+    # One key, so that a sort that knows runs finds those of the file.
+    order = np.argsort(ring * 8.0 + found.azimuth[rows], kind="stable")
+    bounds = np.concatenate([[0], np.cumsum(np.bincount(ring))])
+    return kernel.scan_grid(points, found.azimuth, rows[order], bounds)
+
+
+def _grid_triangles(grid: kernel.ScanGrid, count: int, spacing_rad: float, config: MeshConfig) -> np.ndarray:
     """Strips between neighbouring rings, then across whatever stands between the two ends of a surface.
 
     A branch in front of a wall breaks the wall's strips twice: along the ring, mended by strips that leave
     out the points no strip wanted, and across it, mended for the fragments by strips from every ring to the
     next but one or two. The wall breaks the strips of the branch likewise: where it is thin and slanting,
     an arm held away from the body, it lies beside the wall on the next ring; what no strip wanted gets
-    strips by itself.
+    strips by itself. The scan has `count` points.
     """
-    limits = _limits(config, config.max_edge_rings * _ring_spacing(points, ring))
-    triangles = _strips(points, azimuth, order, ring, limits)
-    meshed = np.zeros(len(points), bool)
-    meshed[triangles.ravel()] = True
+    limits = _limits(config, config.max_edge_rings * spacing_rad)
+    triangles = _all_strips(grid, limits)
+    is_meshed = graphs.touched(triangles, count)[grid.row]
     triangles = np.concatenate([
-        triangles, _strips(points, azimuth, order[meshed[order]], ring, limits),
-        _strips(points, azimuth, order[~meshed[order]], ring, limits)])
+        triangles, _all_strips(kernel.part(grid, is_meshed), limits),
+        _all_strips(kernel.part(grid, ~is_meshed), limits)])
 
-    component = graphs.components(triangles, len(points))
-    is_fragment = np.bincount(component)[component] < _FRAGMENT_POINTS
-    across = [
-        _strips(points, azimuth, order[ring[order] % step == phase], ring // step, limits)
-        for step in (2, 3) for phase in range(step)
-    ]
-    across = np.concatenate(across)
-    return np.concatenate([triangles, across[is_fragment[across].any(axis=1)]])
+    component = graphs.components(triangles, count)
+    in_fragment = np.bincount(component)[component[grid.row]] < _FRAGMENT_POINTS
+    across = [kernel.ring_strips(grid, step, in_fragment, *limits) for step in (2, 3)]
+    return np.concatenate([triangles, *across])
 
 
-def _with_ring_edges(
-    edges: np.ndarray, points: np.ndarray, order: np.ndarray, ring: np.ndarray, config: MeshConfig
-) -> np.ndarray:
-    """`edges` (E, 2) and those along rings to points without any: a level arm is seen by one ring only."""
-    lone = np.ones(len(points), bool)
-    lone[edges.ravel()] = False
-    along = kernel.ring_edges(
-        points, order, _bounds(ring[order]), lone, *_limits(config, max_edge_rad=0.0))
-    edges = np.concatenate([edges, along])
-    return edges[np.argsort(edges[:, 0] * np.int64(len(points)) + edges[:, 1], kind="stable")]
+def _all_strips(grid: kernel.ScanGrid, limits: tuple) -> np.ndarray:
+    return kernel.ring_strips(grid, 1, np.ones(len(grid.row), bool), *limits)
 
 
-def _ring_spacing(points: np.ndarray, ring: np.ndarray) -> float:
-    """Median angle in radians between a ring and the next."""
-    member = np.flatnonzero(ring >= 0)
-    member = member[np.argsort(ring[member], kind="stable")]
-    pitch = np.arctan2(points[member, 2], np.hypot(points[member, 0], points[member, 1]))
-    bounds = np.searchsorted(ring[member], np.arange(1, ring.max() + 1))
-    middle = [np.median(one_ring) for one_ring in np.split(pitch, bounds) if len(one_ring)]
-    return float(np.median(np.abs(np.diff(middle)))) if len(middle) > 1 else 0.0
-
-
-def _strips(
-    points: np.ndarray, azimuth: np.ndarray, order: np.ndarray, ring: np.ndarray, limits: tuple
-) -> np.ndarray:
-    return kernel.ring_strips(points, azimuth, order, _bounds(ring[order]), *limits)
-
-
-def _by_ring(azimuth: np.ndarray, rows: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """`rows` (P,) ring by ring with azimuth ascending."""
-    # One key, so that a sort that knows runs finds those of the file.
-    return rows[np.argsort(ring[rows] * 8.0 + azimuth[rows], kind="stable")]
-
-
-def _bounds(ring: np.ndarray) -> np.ndarray:
-    """Where each of R rings begins in ascending rings (P,), and the end: (R + 1,)."""
-    return np.searchsorted(ring, np.arange(ring[-1] + 2 if len(ring) else 1))
+def _ring_edges(grid: kernel.ScanGrid, on_triangle: np.ndarray, config: MeshConfig) -> np.ndarray:
+    """Edges (E, 2) along rings to points not `on_triangle` (N,): a level arm is seen by one ring only."""
+    return kernel.ring_edges(grid, ~on_triangle[grid.row], *_limits(config, max_edge_rad=0.0))
 
 
 def _tangent_triangles(

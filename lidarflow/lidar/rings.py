@@ -1,9 +1,14 @@
 """Which laser of a spinning sensor each point came from, recovered from file order or from pitch."""
 
+from dataclasses import dataclass
+
 import numpy as np
+
+from lidarflow.kernels import rings as kernel
 
 _MIN_RINGS, _MAX_RINGS = 8, 256
 _MIN_POINTS_PER_RING = 50
+_MIN_RANGE_M = 0.1
 # Lasers sit apart from each other, so one ring's pitch, seen from the common origin, varies with range: by
 # 1.5 of 26 degrees on an HDL-64E.
 _MAX_RING_PITCH_SHARE = 0.1
@@ -11,80 +16,109 @@ _MAX_SHARE_IN_WIDE_RINGS = 0.1   # of the points
 _MAX_STEP_RAD = np.radians(10.0)
 
 
-def recover(points: np.ndarray) -> np.ndarray | None:
-    """Ring index (N,) int32, 0 = highest laser and -1 = none, of points (N, 3) in file order.
+@dataclass(frozen=True, slots=True, eq=False)
+class Rings:
+    """The lasers of a spinning sensor that N points came from.
+
+    index        (N,) int32     0 = highest laser, -1 = none
+    azimuth      (N,) float64   of all points
+    spacing_rad  float          median angle between a ring and the next
+    """
+
+    index: np.ndarray
+    azimuth: np.ndarray
+    spacing_rad: float
+
+
+def recover(points: np.ndarray) -> Rings | None:
+    """The rings of points (N, 3) in file order.
 
     None when the cloud is not one revolution of a spinning multi-beam sensor. Rows that are not finite, or
-    lie on the sensor, get -1.
+    lie on the sensor, have no laser.
     """
-    usable = np.isfinite(points).all(axis=1)
-    usable[usable] = np.linalg.norm(points[usable], axis=1) > 0.1
-    if usable.sum() < _MIN_RINGS * _MIN_POINTS_PER_RING:
+    rows = np.flatnonzero(kernel.usable(points, _MIN_RANGE_M))
+    if len(rows) < _MIN_RINGS * _MIN_POINTS_PER_RING:
         return None
-    x, y, z = points[usable].T
-    azimuth, pitch = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
-    found = _from_file_order(azimuth, pitch)
+    x, y, z = points.T
+    azimuth, pitch = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))[rows]
+    found = _from_file_order(azimuth[rows], pitch)
     if found is None:
         found = _from_pitch(pitch)
     if found is None:
         return None
-    ring = np.full(len(points), -1, np.int32)
-    ring[usable] = found
-    return ring
+    index = np.full(len(points), -1, np.int32)
+    index[rows], spacing_rad = found
+    return Rings(index, azimuth, spacing_rad)
 
 
-def _from_file_order(azimuth: np.ndarray, pitch: np.ndarray) -> np.ndarray | None:
-    """Rings of a file that stores one laser's revolution after another (KITTI, row-major images)."""
-    step = (np.diff(azimuth) + np.pi) % (2 * np.pi) - np.pi
-    direction = np.sign(np.median(step))
-    if direction == 0 or (np.abs(step) < _MAX_STEP_RAD).mean() < 0.9:
+def _from_file_order(azimuth: np.ndarray, pitch: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Lasers (P,) and spacing of a file of one revolution after another (KITTI, row-major images)."""
+    step = kernel.steps(azimuth)
+    direction, step_size = np.sign(_median(step)), np.abs(step)
+    if direction == 0 or np.count_nonzero(step_size < _MAX_STEP_RAD) / len(step) < 0.9:
         return None
-    # Half a step before the first point, so that a ring that starts beside it starts behind the cut.
-    turned = (direction * (azimuth - azimuth[0]) + 0.5 * np.median(np.abs(step))) % (2 * np.pi)
-    starts = np.flatnonzero(np.diff(turned) < -_MAX_STEP_RAD) + 1   # a high ring may see one house, no cut
-    ring = np.zeros(len(azimuth), np.int64)
-    ring[starts] = 1
-    ring = np.cumsum(ring)
-    counts = np.bincount(ring)
+    # Half a step before the first point, so that a ring that starts beside it starts behind the cut. A high
+    # ring may see one house, and no cut.
+    starts = kernel.cuts(azimuth, direction, 0.5 * _median(step_size), _MAX_STEP_RAD)
     # The cut is crossed more than once where azimuth jitters there: short pieces belong to their neighbour.
-    ring = (np.cumsum(counts >= _MIN_POINTS_PER_RING) - 1).clip(0)[ring]
-    return _checked(ring, pitch)
+    starts = np.concatenate([[0], starts])
+    starts = starts[np.diff(starts, append=len(azimuth)) >= _MIN_POINTS_PER_RING]
+    bounds = np.concatenate([[0], starts[1:], [len(azimuth)]])
+    lasers = _lasers(pitch, bounds)
+    if lasers is None:
+        return None
+    return np.repeat(lasers[0], np.diff(bounds)), lasers[1]
 
 
-def _from_pitch(pitch: np.ndarray) -> np.ndarray | None:
-    """Rings of a cloud whose pitch takes few values (nominal beam angles, any file order)."""
+def _from_pitch(pitch: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Lasers (P,), or -1, and spacing where pitch takes few values (nominal beam angles, any file order)."""
     order = np.argsort(pitch, kind="stable")
-    gaps = np.diff(pitch[order])
-    ring = np.empty(len(pitch), np.int64)
-    ring[order] = np.concatenate([[0], np.cumsum(gaps > np.radians(0.08))])
-    counts = np.bincount(ring)
-    large = counts >= _MIN_POINTS_PER_RING
-    if counts[large].sum() < 0.95 * len(pitch):
+    ascending = pitch[order]
+    starts = np.flatnonzero(np.diff(ascending) > np.radians(0.08)) + 1
+    counts = np.diff(np.concatenate([[0], starts, [len(pitch)]]))
+    is_large = counts >= _MIN_POINTS_PER_RING
+    if counts[is_large].sum() < 0.95 * len(pitch):
         return None
-    renumbered = np.cumsum(large) - 1
-    ring = np.where(large[ring], renumbered[ring], -1)
-    if not (ring >= 0).any():
+    lasers = _lasers(
+        ascending[np.repeat(is_large, counts)], np.concatenate([[0], np.cumsum(counts[is_large])]))
+    if lasers is None:
         return None
-    return _checked(ring, pitch)
+    laser_of_piece = np.full(len(counts), -1, np.int32)
+    laser_of_piece[is_large], spacing_rad = lasers
+    laser = np.empty(len(pitch), np.int32)
+    laser[order] = np.repeat(laser_of_piece, counts)
+    return laser, spacing_rad
 
 
-def _checked(ring: np.ndarray, pitch: np.ndarray) -> np.ndarray | None:
-    """`ring` renumbered from the highest laser down, or None if rings are not cones of equal pitch."""
-    count = ring.max() + 1
-    if not _MIN_RINGS <= count <= _MAX_RINGS:
+def _lasers(pitch: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Laser (R,) int32 of each ring, counted from the highest, and their spacing in radians.
+
+    Ring r has pitch[bounds[r]:bounds[r + 1]]. None if rings are not cones of equal pitch.
+    """
+    counts = np.diff(bounds)
+    if not _MIN_RINGS <= len(counts) <= _MAX_RINGS:
         return None
-    member = ring >= 0
-    order = np.lexsort((pitch, np.where(member, ring, count)))[: member.sum()]
-    bounds = np.searchsorted(ring[order], np.arange(count + 1))
-    low, middle, high = (pitch[order][_rank(bounds, share)] for share in (0.1, 0.5, 0.9))
+    # Of two numbers in the middle, rings are ordered by the first; their mean is the median.
+    ranks = np.column_stack([
+        _rank(bounds, 0.1), _rank(bounds, 0.5), bounds[:-1] + counts // 2, _rank(bounds, 0.9)])
+    low, middle, next_to_middle, high = kernel.at_ranks(pitch, bounds, ranks).T
     is_wide = high - low > _MAX_RING_PITCH_SHARE * np.ptp(middle)
-    if np.diff(bounds)[is_wide].sum() > _MAX_SHARE_IN_WIDE_RINGS * len(order):
+    if counts[is_wide].sum() > _MAX_SHARE_IN_WIDE_RINGS * len(pitch):
         return None
-    rank = np.empty(count, np.int32)
-    rank[np.argsort(-middle, kind="stable")] = np.arange(count, dtype=np.int32)
-    return np.where(member, rank[ring], -1).astype(np.int32)
+    from_highest = np.argsort(-middle, kind="stable")
+    laser = np.empty(len(counts), np.int32)
+    laser[from_highest] = np.arange(len(counts), dtype=np.int32)
+    median = (0.5 * (middle + next_to_middle))[from_highest]
+    return laser, float(np.median(np.abs(np.diff(median))))
 
 
 def _rank(bounds: np.ndarray, share: float) -> np.ndarray:
     """Index of the entry at `share` of each sorted segment [bounds[r], bounds[r+1])."""
     return (bounds[:-1] + share * (bounds[1:] - bounds[:-1] - 1)).astype(np.int64)
+
+
+def _median(values: np.ndarray) -> float:
+    """As np.median of numbers none of which is NaN: looking for those takes it longer than the rest."""
+    half = len(values) // 2
+    parted = np.partition(values, half)
+    return float(parted[half] if len(values) % 2 else 0.5 * (parted[:half].max() + parted[half]))
