@@ -54,6 +54,18 @@ def check_lanes(count: int) -> None:
     assert lanes.total(sums, 1) == lanes.WIDTH * (lanes.WIDTH - 1) / 2
 
 
+def check_gathered(count: int) -> None:
+    numbers, corner = rng(4).uniform(-1, 1, (count, 5)), np.array([0.5, -0.5, 0.25])
+    seen = cells.build(numbers[:, :3], 0.7)
+    near = np.arange(0, len(seen.place), 2)
+    block = lanes.gathered(numbers, seen, near, corner).reshape(-1, 5, lanes.WIDTH)
+    rows = block.transpose(0, 2, 1).reshape(-1, 5)
+    members = np.concatenate([seen.order[seen.bounds[cell]: seen.bounds[cell + 1]] for cell in near])
+    expected = numbers[members] - np.append(corner, [0.0, 0.0])
+    np.testing.assert_allclose(rows[: len(members)], expected, atol=1e-6)
+    assert (rows[len(members):, 0] == lanes.FAR).all()
+
+
 def check_deviation(count: int) -> None:
     random = rng(2)
     root, points, centre = 0.01 * random.normal(size=(6, 6)), random.normal(0, 9, (count, 3)), np.arange(3.0)
@@ -69,6 +81,7 @@ def check_all_tiny() -> None:
     check_cells(40)
     check_no_cells()
     check_lanes(20)
+    check_gathered(40)
     check_deviation(5)
 
 
@@ -80,6 +93,7 @@ def test_cells():
 def test_lanes():
     for count in (0, 1, lanes.WIDTH, 100):
         check_lanes(count)
+    check_gathered(300)
 
 
 def test_deviation():

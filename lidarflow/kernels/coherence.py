@@ -56,7 +56,7 @@ def _some_shifts(points, asked, planes, seen, start, end, min_planes, min_rms_m,
         found = cells.around(seen, asked.place[cell], near)
         for k in range(3):
             corner[k] = asked.place[cell, k] * asked.cell_m
-        block = _gathered(planes, seen, near[:found], corner)
+        block = lanes.gathered(planes, seen, near[:found], corner)
         for i in asked.order[asked.bounds[cell]: asked.bounds[cell + 1]]:
             _add_up(block, np.float32(points[i, 0] - corner[0]), np.float32(points[i, 1] - corner[1]),
                     np.float32(points[i, 2] - corner[2]), np.float32(seen.cell_m * seen.cell_m), sums)
@@ -67,25 +67,6 @@ def _some_shifts(points, asked, planes, seen, start, end, min_planes, min_rms_m,
             if counts[i] >= min_planes and before_m[i] >= min_rms_m:
                 after_m[i] = _shift(sums, counts[i], factor, t)
                 shifts[i] = t
-
-
-@njit()
-def _gathered(planes, seen, near, corner):
-    """A block of the planes (K, 7) in some cells, their points as offsets from a corner (3,)."""
-    count = 0
-    for cell in near:
-        count += seen.bounds[cell + 1] - seen.bounds[cell]
-    block, count = lanes.blocks(_ROWS, count), 0
-    for cell in near:
-        for place in range(seen.bounds[cell], seen.bounds[cell + 1]):
-            at, plane = lanes.column(_ROWS, count), planes[seen.order[place]]
-            for k in range(3):
-                block[at + k * lanes.WIDTH] = plane[k] - corner[k]
-            for k in range(3, _ROWS):
-                block[at + k * lanes.WIDTH] = plane[k]
-            count += 1
-    lanes.pad(block, _ROWS, count)
-    return block
 
 
 @njit()

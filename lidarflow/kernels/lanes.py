@@ -33,6 +33,26 @@ def column(rows, k):
 
 
 @njit()
+def gathered(numbers, seen, near, corner):
+    """A block of the points in some cells `near` (K,) of `seen`.
+
+    The first three of their numbers (N, rows) are where they are, of which a corner (3,) is taken away.
+    """
+    rows, count = numbers.shape[1], 0
+    for cell in near:
+        count += seen.bounds[cell + 1] - seen.bounds[cell]
+    block, count = blocks(rows, count), 0
+    for cell in near:
+        for place in range(seen.bounds[cell], seen.bounds[cell + 1]):
+            at, own = column(rows, count), numbers[seen.order[place]]
+            for k in range(rows):
+                block[at + k * WIDTH] = own[k] - corner[k] if k < 3 else own[k]
+            count += 1
+    pad(block, rows, count)
+    return block
+
+
+@njit()
 def pad(block, rows, count):
     """Fill the columns behind `count` points; the first number of each is FAR, others are 0."""
     for k in range(count, padded(count)):

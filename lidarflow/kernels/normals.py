@@ -43,28 +43,11 @@ def _estimate_some(points, asked, surface, seen, start, end, normals):
         found = cells.around(seen, asked.place[cell], near)
         for k in range(3):
             corner[k] = asked.place[cell, k] * asked.cell_m
-        block = _gathered(surface, seen, near[:found], corner)
+        block = lanes.gathered(surface, seen, near[:found], corner)
         for i in asked.order[asked.bounds[cell]: asked.bounds[cell + 1]]:
             _add_up(block, np.float32(points[i, 0] - corner[0]), np.float32(points[i, 1] - corner[1]),
                     np.float32(points[i, 2] - corner[2]), np.float32(seen.cell_m * seen.cell_m), sums)
             _fit(points[i], sums, values, across, normals[i])
-
-
-@njit()
-def _gathered(surface, seen, near, corner):
-    """A block of the surface's points in some cells, as offsets from a corner (3,)."""
-    count = 0
-    for cell in near:
-        count += seen.bounds[cell + 1] - seen.bounds[cell]
-    block, count = lanes.blocks(_ROWS, count), 0
-    for cell in near:
-        for place in range(seen.bounds[cell], seen.bounds[cell + 1]):
-            at = lanes.column(_ROWS, count)
-            for k in range(3):
-                block[at + k * lanes.WIDTH] = surface[seen.order[place], k] - corner[k]
-            count += 1
-    lanes.pad(block, _ROWS, count)
-    return block
 
 
 @njit()
