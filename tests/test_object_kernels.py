@@ -335,10 +335,10 @@ def check_registration_equations(count: int) -> None:
     target = tree.build(cloud)
     ordered = np.ascontiguousarray(normal[target.rows])
     points, reach_m = rng(32).uniform(-2, 2, (2 * count, 3)), 0.4
-    pairs = registration.Pairs(len(points))
-    for step in range(3):   # pairs are kept from round to round
+    known = icp.nothing_known(len(points))
+    for step in range(3):   # what is nearest is kept from round to round
         motion = pose.exp(0.02 * step * np.ones(6))
-        found = registration.normal_equations(points, motion, target, ordered, reach_m, pairs)
+        found = registration.normal_equations(points, motion, target, ordered, reach_m, known)
         moved = pose.apply(motion, points)
         apart = np.linalg.norm(moved[:, None] - cloud[None], axis=2)
         nearest = apart.argmin(axis=1)

@@ -69,14 +69,6 @@ class Fit(NamedTuple):
     point_weight: float
 
 
-class _Nearest(NamedTuple):
-    """Which place of the target each row is nearest to, as icp.follow keeps it from round to round."""
-
-    place: np.ndarray
-    asked: np.ndarray
-    clear_m: np.ndarray
-
-
 def grow_each(
     seeds, bounds, starts, free, source, own, target, target_normals, ground, limits, fit, gates_m
 ):
@@ -99,9 +91,8 @@ def _grow_each(
     did, motions
 ):
     """Each thread takes the next growth when it has done one: they differ in size, and it changes nothing."""
-    count = len(own.points)
     for _ in numba.prange(threads):
-        nearest = _Nearest(np.empty(count, np.int64), np.empty((count, 3)), np.empty(count))
+        nearest = icp.nothing_known(len(own.points))
         h = queue.take(waiting)
         while h < len(motions):
             _grow(seeds[bounds[h]: bounds[h + 1]], free, source, own, target, target_normals, ground, limits,
@@ -137,7 +128,7 @@ def _newly_asked(rows, did, nearest):
     for row in rows:
         if did[row] == 0:
             did[row] = ASKED
-            nearest.place[row], nearest.asked[row], nearest.clear_m[row] = -1, 0.0, -np.inf
+            icp.forget(nearest, row)
             new[count] = row
             count += 1
     return new[:count]
@@ -153,8 +144,7 @@ def _agreeing(near, free, motion, own, target, target_normals, ground, limits, n
             continue
         ego_m, ego_plane_m = own.by_ego_m[row], own.by_ego_plane_m[row]
         x, y, z = moved(own.points[row], motion)
-        place, apart_sq = icp.follow(
-            target, x, y, z, 2.0 * limits.cap_m, row, nearest.place, nearest.asked, nearest.clear_m)
+        place, apart_sq = icp.follow(target, x, y, z, 2.0 * limits.cap_m, row, nearest)
         own_m, plane_m = misfit.beyond_nearest(
             x, y, z, place, apart_sq, own.normals[row], motion, target, target_normals, ground, limits.cap_m,
             limits.min_agreement)

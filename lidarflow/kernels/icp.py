@@ -4,6 +4,7 @@ A motion is a turn in radians about the vertical through the group's centre, the
 """
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -20,6 +21,31 @@ _SETTLED = 1e-4              # a round that changes less, in metres and radians,
 _ROUNDING_M = 1e-9           # distances are taken as equal up to this
 _BEYOND_GATE = 1.5           # nearest points are searched for this much farther than the gate
 _REGULARISATION = 1e-6       # share of all weight that directions nothing holds are held back by
+
+
+class Nearest(NamedTuple):
+    """Which place of a target each of N points is nearest to, kept from one round to the next by `follow`.
+
+    place    (N,) int64       nearest when the point was at `asked`, -1 = none
+    asked    (N, 3) float64
+    clear_m  (N,) float64     nothing else was as near as this
+    """
+
+    place: np.ndarray
+    asked: np.ndarray
+    clear_m: np.ndarray
+
+
+@njit()
+def nothing_known(count):
+    """Nearest places of so many points before any is searched for."""
+    return Nearest(np.full(count, -1), np.zeros((count, 3)), np.full(count, -np.inf))
+
+
+@njit(inline="always")
+def forget(nearest, i):
+    """Let point i be searched for when it is next asked for."""
+    nearest.place[i], nearest.clear_m[i] = -1, -np.inf
 
 
 @njit(parallel=True)
@@ -43,7 +69,7 @@ def _onto_points(points, target, translation, gates_m, rounds_per_gate, motion):
     centre = mean(points)
     count = len(points)
     turn, shift = 0.0, translation.copy()
-    place, asked, clear_m = np.full(count, -1), np.zeros((count, 3)), np.full(count, -np.inf)
+    nearest = nothing_known(count)
     for gate_m in gates_m:
         for _ in range(rounds_per_gate):
             cosine, sine = math.cos(turn), math.sin(turn)
@@ -54,7 +80,7 @@ def _onto_points(points, target, translation, gates_m, rounds_per_gate, motion):
                 x = cosine * ax - sine * ay + centre[0] + shift[0]
                 y = sine * ax + cosine * ay + centre[1] + shift[1]
                 z = az + centre[2] + shift[2]
-                near, _ = follow(target, x, y, z, gate_m, i, place, asked, clear_m)
+                near, _ = follow(target, x, y, z, gate_m, i, nearest)
                 if near < 0:
                     continue
                 at = target.points[near]
@@ -96,13 +122,12 @@ def onto_planes(
     """
     centre = mean(points)
     shift = shift.copy()
-    place, asked = np.full(len(points), -1), np.zeros((len(points), 3))
-    clear_m = np.full(len(points), -np.inf)
+    nearest = nothing_known(len(points))
     for gate_m in gates_m:
         matrix, right = np.zeros((4, 4)), np.zeros(4)
         total, count = _add_pairs(
             points, normals, target, target_normals, centre, turn, shift, gate_m, plane_scale_m,
-            point_scale_m, point_weight, min_agreement, place, asked, clear_m, matrix, right)
+            point_scale_m, point_weight, min_agreement, nearest, matrix, right)
         if count < MIN_POINTS:
             break
         held = along_ground * total
@@ -132,7 +157,7 @@ def onto_planes(
 @njit()
 def _add_pairs(
     points, normals, target, target_normals, centre, turn, shift, gate_m, plane_scale_m, point_scale_m,
-    point_weight, min_agreement, place, asked, clear_m, matrix, right,
+    point_weight, min_agreement, nearest, matrix, right,
 ):
     """Add the pairs' share to the lower triangle of the normal equations; returns weight and number."""
     cosine, sine = math.cos(turn), math.sin(turn)
@@ -141,7 +166,7 @@ def _add_pairs(
         dx, dy, dz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         tx, ty = cosine * dx - sine * dy, sine * dx + cosine * dy
         x, y, z = tx + centre[0] + shift[0], ty + centre[1] + shift[1], dz + centre[2] + shift[2]
-        near, apart_sq = follow(target, x, y, z, gate_m, i, place, asked, clear_m)
+        near, apart_sq = follow(target, x, y, z, gate_m, i, nearest)
         if near < 0:
             continue
         count += 1
@@ -181,29 +206,28 @@ def _add_pairs(
 
 
 @njit(inline="always")
-def follow(target, x, y, z, gate_m, i, place, asked, clear_m):
+def follow(target, x, y, z, gate_m, i, nearest):
     """Nearest place to x, y, z within the gate, -1 without one, and its squared distance, for point i.
 
-    place (N,) was nearest when the point was at asked (N, 3), and nothing else was within clear_m (N,). While
-    a point has moved by less than what sets the two apart, none is searched for.
+    While a point has moved by less than what sets the nearest apart from all others, none is searched for.
     """
-    left_m = math.sqrt(trees.distance_sq(asked, i, x, y, z))
+    left_m = math.sqrt(trees.distance_sq(nearest.asked, i, x, y, z))
     apart_sq = np.inf
-    if place[i] >= 0:
-        apart_sq = trees.distance_sq(target.points, place[i], x, y, z)
-    if min(math.sqrt(apart_sq), gate_m) >= clear_m[i] - left_m - _ROUNDING_M:
-        apart_sq = _search(target, x, y, z, gate_m, i, place, asked, clear_m)
-    return (place[i] if apart_sq < gate_m * gate_m else -1), apart_sq
+    if nearest.place[i] >= 0:
+        apart_sq = trees.distance_sq(target.points, nearest.place[i], x, y, z)
+    if min(math.sqrt(apart_sq), gate_m) >= nearest.clear_m[i] - left_m - _ROUNDING_M:
+        apart_sq = _search(target, x, y, z, gate_m, i, nearest)
+    return (nearest.place[i] if apart_sq < gate_m * gate_m else -1), apart_sq
 
 
 @njit()
-def _search(target, x, y, z, gate_m, i, place, asked, clear_m):
+def _search(target, x, y, z, gate_m, i, nearest):
     """Squared distance to the nearest place, which is noted for point i."""
     # Beyond the gate as well: what is known to be empty there need not be searched again after every step.
     reach_m = _BEYOND_GATE * gate_m
-    place[i], apart_sq, second_sq = trees.nearest_two(target, x, y, z, reach_m * reach_m)
-    clear_m[i] = math.sqrt(second_sq)
-    asked[i, 0], asked[i, 1], asked[i, 2] = x, y, z
+    nearest.place[i], apart_sq, second_sq = trees.nearest_two(target, x, y, z, reach_m * reach_m)
+    nearest.clear_m[i] = math.sqrt(second_sq)
+    nearest.asked[i, 0], nearest.asked[i, 1], nearest.asked[i, 2] = x, y, z
     return apart_sq
 
 

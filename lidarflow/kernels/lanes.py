@@ -1,13 +1,14 @@
 """Numbers of many points side by side, so that loops over them compile to vector instructions.
 
-A block holds float32 rows of WIDTH numbers, a row for each number of a point: WIDTH points stand beside one
-another in its columns, the next WIDTH in the next rows. Sums have rows of the same width, one for each sum;
-every lane adds up its own column, and lanes are added in order in the end. So the order of additions is
-fixed, as it would not be if the compiler were free to choose it.
+A block holds rows of WIDTH numbers, a row for each number of a point: WIDTH points stand beside one another
+in its columns, the next WIDTH in the next rows. Sums have rows of the same width, one for each sum; every
+lane adds up its own column, and lanes are added in order in the end. So the order of additions is fixed, as
+it would not be if the compiler were free to choose it. Short offsets are held in single precision.
 """
 
 import numpy as np
 
+from lidarflow.kernels import cells
 from lidarflow.kernels.compiled import njit
 
 WIDTH = 16
@@ -30,6 +31,18 @@ def padded(count):
 def column(rows, k):
     """Where the first row of the k-th point is; the next ones are WIDTH further on."""
     return rows * WIDTH * (k // WIDTH) + k % WIDTH
+
+
+@njit()
+def gathered_around(numbers, seen, place, near, corner):
+    """A block of the points in and around the cell at `place` (3,) of `seen`, as offsets from its corner.
+
+    Fills `near` (cells.NEAR,) with these cells, and the corner (3,).
+    """
+    for k in range(3):
+        corner[k] = place[k] * seen.cell_m
+    found = cells.around(seen, place, near)
+    return gathered(numbers, seen, near[:found], corner)
 
 
 @njit()

@@ -40,10 +40,7 @@ def _estimate_some(points, asked, surface, seen, start, end, normals):
     values, across = np.empty(3), np.empty(3)
     sums = np.empty(_SUMS * lanes.WIDTH, np.float32)
     for cell in range(start, end):
-        found = cells.around(seen, asked.place[cell], near)
-        for k in range(3):
-            corner[k] = asked.place[cell, k] * asked.cell_m
-        block = lanes.gathered(surface, seen, near[:found], corner)
+        block = lanes.gathered_around(surface, seen, asked.place[cell], near, corner)
         for i in asked.order[asked.bounds[cell]: asked.bounds[cell + 1]]:
             _add_up(block, np.float32(points[i, 0] - corner[0]), np.float32(points[i, 1] - corner[1]),
                     np.float32(points[i, 2] - corner[2]), np.float32(seen.cell_m * seen.cell_m), sums)

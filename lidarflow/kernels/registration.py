@@ -7,38 +7,23 @@ import numpy as np
 
 from lidarflow.kernels import lanes
 from lidarflow.kernels.compiled import njit
-from lidarflow.kernels.icp import follow
+from lidarflow.kernels.icp import Nearest, follow
 from lidarflow.kernels.linalg import moved
 
 _CHUNK = 512     # points that one thread takes at a time; their sums are added in order
-
 _ROWS = 8        # of a block: where a point is, the plane it meets, how far off that is, what the pair weighs
 _SUMS = 28       # lower triangle of the matrix, right side, number of pairs
 
 
-class Pairs:
-    """Which point of a target each of N points is nearest to, kept from one round to the next.
-
-    place (N,) was nearest when the point was at asked (N, 3), and nothing else was within clear_m (N,).
-    """
-
-    __slots__ = ("asked", "clear_m", "place")
-
-    def __init__(self, count: int):
-        self.place = np.full(count, -1)
-        self.asked = np.zeros((count, 3))
-        self.clear_m = np.full(count, -np.inf)
-
-
-def normal_equations(points, motion, target, target_normals, reach_m, pairs: Pairs):
+def normal_equations(points, motion, target, target_normals, reach_m, nearest: Nearest):
     """Matrix (6, 6) and right side (6,) of one Gauss-Newton step, and how many points it rests on.
 
     The step is a twist (rotation first) to be applied after `motion` (4, 4); it lowers Σ ρ(n · (T p − q)) of
     points p (N, 3) whose nearest q in the tree `target` is within `reach_m`. ρ is Tukey's, as wide as the
-    reach, n of target_normals (M, 3) in the order of the tree, NaN where there is none.
+    reach, n of target_normals (M, 3) in the order of the tree, NaN where there is none. `nearest` is
+    kept from round to round.
     """
-    sums = _sums(
-        points, motion, target, target_normals, float(reach_m), pairs.place, pairs.asked, pairs.clear_m)
+    sums = _sums(points, motion, target, target_normals, float(reach_m), nearest)
     matrix = np.zeros((6, 6))
     matrix[_LOWER] = sums[:21]
     return matrix + np.tril(matrix, -1).T, sums[21:27], int(sums[27])
@@ -48,14 +33,13 @@ _LOWER = np.tril_indices(6)
 
 
 @njit(parallel=True)
-def _sums(points, motion, target, target_normals, reach_m, place, asked, clear_m):
+def _sums(points, motion, target, target_normals, reach_m, nearest):
     chunks = (len(points) + _CHUNK - 1) // _CHUNK
     parts = np.zeros((chunks, _SUMS))
     for chunk in numba.prange(chunks):
         start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
         block = np.zeros(_ROWS * lanes.padded(end - start))     # columns that stay empty weigh nothing
-        parts[chunk, -1] = _meet(
-            points, start, end, motion, target, target_normals, reach_m, place, asked, clear_m, block)
+        parts[chunk, -1] = _meet(points, start, end, motion, target, target_normals, reach_m, nearest, block)
         _add_up(block, parts[chunk])
     total = np.zeros(_SUMS)
     for chunk in range(chunks):
@@ -64,12 +48,12 @@ def _sums(points, motion, target, target_normals, reach_m, place, asked, clear_m
 
 
 @njit()
-def _meet(points, start, end, motion, target, target_normals, reach_m, place, asked, clear_m, block):
+def _meet(points, start, end, motion, target, target_normals, reach_m, nearest, block):
     """Fill a block with the points from `start` to `end` that meet a plane; returns how many do."""
     count, width = 0, lanes.WIDTH
     for i in range(start, end):
         x, y, z = moved(points[i], motion)
-        near, _ = follow(target, x, y, z, reach_m, i, place, asked, clear_m)
+        near, _ = follow(target, x, y, z, reach_m, i, nearest)
         if near < 0 or math.isnan(target_normals[near, 0]):
             continue
         nx, ny, nz = target_normals[near, 0], target_normals[near, 1], target_normals[near, 2]

@@ -31,9 +31,7 @@ def moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
 
 def seems_to_move(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
     """Whether all but the matches, which cost most, says that a body moves."""
-    points = view.points[body.rows]
-    moved = pose.apply(body.over_ground, points)
-    shift = (moved - points).mean(axis=0)
+    points, moved, shift = _shifted(view, body)
     if np.hypot(shift[0], shift[1]) < config.min_speed_m_per_s * dt_s:
         return False
     # What costs most comes last.
@@ -51,10 +49,16 @@ def matches_agree(view: View, body: Body, config: ObjectsConfig) -> bool:
     rows, places = view.matches(body.rows)
     if len(rows) < max(config.min_matches, 1):
         return config.min_matches == 0
-    points = view.points[body.rows]
-    shift = (pose.apply(body.over_ground, points) - points).mean(axis=0)
+    _, _, shift = _shifted(view, body)
     off = votes.median(places - pose.apply(body.over_ground, view.points[rows]))
     return np.hypot(off[0], off[1]) <= min(config.max_match_deviation * np.hypot(shift[0], shift[1]), CAP_M)
+
+
+def _shifted(view: View, body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The body's points (K, 3), where they go (K, 3), and their mean shift (3,)."""
+    points = view.points[body.rows]
+    moved = pose.apply(body.over_ground, points)
+    return points, moved, (moved - points).mean(axis=0)
 
 
 def _clearance(view: View, points: np.ndarray) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.errors import DataError
-from lidarflow.kernels import grid, neighbours, normals, tree
+from lidarflow.kernels import grid, icp, neighbours, normals, tree
 from lidarflow.kernels import registration as kernel
 from lidarflow.kernels.tree import Tree
 from lidarflow.open3d_import import open3d
@@ -65,20 +65,20 @@ def robust_point_to_plane(
     found within the last reach counts; before, some of the points, evenly over their order, lead there.
     """
     some = source[::max(len(source) // _LEADING_POINTS, 1)]
-    motion, pairs = start, kernel.Pairs(len(some))
+    motion, nearest = start, icp.nothing_known(len(some))
     for reach_m in reaches_m:
-        motion = _settled(some, target, reach_m, motion, pairs, _NEARLY_SETTLED)
-    return _settled(source, target, reaches_m[-1], motion, kernel.Pairs(len(source)), _SETTLED)
+        motion = _settled(some, target, reach_m, motion, nearest, _NEARLY_SETTLED)
+    return _settled(source, target, reaches_m[-1], motion, icp.nothing_known(len(source)), _SETTLED)
 
 
 def _settled(
-    source: np.ndarray, target: Planes, reach_m: float, motion: np.ndarray, pairs: kernel.Pairs,
+    source: np.ndarray, target: Planes, reach_m: float, motion: np.ndarray, nearest: icp.Nearest,
     settled: float,
 ) -> np.ndarray:
     """`motion` (4, 4) after steps within one reach, until one is smaller than `settled`."""
     for _ in range(_MOST_ROUNDS):
         matrix, right, count = kernel.normal_equations(
-            source, motion, target.tree, target.normals, reach_m, pairs)
+            source, motion, target.tree, target.normals, reach_m, nearest)
         if count < _MIN_POINTS:
             break
         # What no plane holds, as in a corridor, is left where it is.
