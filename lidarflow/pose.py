@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 _SMALL_ANGLE = 1e-4
+_BLOCK = 16384   # rows of one product: more, and BLAS starts threads that go on spinning when it is done
 
 
 def identity(*shape: int) -> np.ndarray:
@@ -49,13 +50,24 @@ def inverse(motion: np.ndarray) -> np.ndarray:
 def apply(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (..., 3) in metres moved by motions (..., 4, 4); the leading shapes broadcast."""
     if motion.ndim == 2:
-        return points @ motion[:3, :3].T + motion[:3, 3]
+        return _turned_and_shifted(motion, points, motion[:3, 3])
     return np.einsum("...ij,...j->...i", motion[..., :3, :3], points) + motion[..., :3, 3]
 
 
 def turn(motion: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 3), such as velocities, in the axes that a motion (4, 4) leads to; nothing is shifted."""
-    return vectors @ motion[:3, :3].T
+    return _turned_and_shifted(motion, vectors, np.zeros(3))
+
+
+def _turned_and_shifted(motion: np.ndarray, vectors: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) turned by one motion (4, 4), then shifted (3,)."""
+    rows, turned = vectors.reshape(-1, 3), np.ascontiguousarray(motion[:3, :3].T)
+    moved = np.empty((len(rows), 3))
+    for start in range(0, len(rows), _BLOCK):
+        block = moved[start: start + _BLOCK]
+        np.matmul(rows[start: start + _BLOCK], turned, out=block)
+        block += shift
+    return moved.reshape(vectors.shape)
 
 
 def aligned(source: np.ndarray, target: np.ndarray) -> np.ndarray:

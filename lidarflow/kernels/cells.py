@@ -29,11 +29,12 @@ class Cells(NamedTuple):
 
 def build(points: np.ndarray, cell_m: float) -> Cells:
     """The cells of finite points (N, 3), in the order they first appear."""
-    return _build(np.ascontiguousarray(points, float), float(cell_m))
+    return built(np.ascontiguousarray(points, float), float(cell_m))
 
 
 @njit()
-def _build(points, cell_m):
+def built(points, cell_m):
+    """As `build`, for other kernels."""
     place, table, number, counts = _hashed(points, cell_m)
     bounds = np.zeros(len(counts) + 1, np.int64)
     bounds[1:] = np.cumsum(counts)

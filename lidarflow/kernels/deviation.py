@@ -8,6 +8,26 @@ from lidarflow.kernels.compiled import njit
 
 
 @njit()
+def information(at, normals, centre, weights):
+    """What planes tell of the twist (rotation first) about `centre` (3,) of a cloud that lies on them (6, 6).
+
+    A plane at x (K, 3) with the normal n (K, 3) and its weight (K,) adds w JᵀJ, J = [(x − centre) × n, n].
+    """
+    total, row = np.zeros((6, 6)), np.empty(6)
+    for i in range(len(at)):
+        x, y, z = at[i, 0] - centre[0], at[i, 1] - centre[1], at[i, 2] - centre[2]
+        row[3], row[4], row[5] = normals[i, 0], normals[i, 1], normals[i, 2]
+        row[0], row[1], row[2] = y * row[5] - z * row[4], z * row[3] - x * row[5], x * row[4] - y * row[3]
+        for a in range(6):
+            for b in range(a + 1):
+                total[a, b] += weights[i] * row[a] * row[b]
+    for a in range(6):
+        for b in range(a):
+            total[b, a] = total[a, b]
+    return total
+
+
+@njit()
 def of_twist(covariance, points, centre, own_m, own_rad):
     """Standard deviation (N,) in metres, over all axes, of points (N, 3) that a twist moves about `centre`.
 

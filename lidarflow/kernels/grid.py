@@ -41,11 +41,12 @@ def means(points: np.ndarray, voxel_m: float) -> np.ndarray:
 
     The lowest point along each axis is in the middle of a voxel.
     """
-    return _means(np.ascontiguousarray(points), float(voxel_m))
+    return averaged(np.ascontiguousarray(points), float(voxel_m))
 
 
 @njit()
-def _means(points, voxel_m):
+def averaged(points, voxel_m):
+    """As `means`, for other kernels."""
     lower, placed = np.full(3, np.inf), np.empty_like(points)
     for i in range(len(points)):
         for k in range(3):

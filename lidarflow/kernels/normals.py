@@ -20,11 +20,12 @@ def estimate(points: np.ndarray, surface: np.ndarray, radius_m: float) -> np.nda
     They face the sensor at the origin. NaN where there are too few neighbours or they lie on a line.
     """
     asked, seen = cells.build(points, radius_m), cells.build(surface, radius_m)
-    return _estimate(np.ascontiguousarray(points), asked, np.ascontiguousarray(surface), seen)
+    return estimated(np.ascontiguousarray(points), asked, np.ascontiguousarray(surface), seen)
 
 
 @njit(parallel=True)
-def _estimate(points, asked, surface, seen):
+def estimated(points, asked, surface, seen):
+    """As `estimate`, for other kernels: points and surface also by cells of the radius."""
     normals = np.full((len(points), 3), np.nan)
     count = len(asked.place)
     for chunk in numba.prange((count + _CHUNK - 1) // _CHUNK):

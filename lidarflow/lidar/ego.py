@@ -16,7 +16,6 @@ from lidarflow.lidar.registration import (
     reproducible,
     robust_point_to_plane,
     thinned,
-    voxel_for,
 )
 from lidarflow.types import FlowResult, Scan, ScanPair
 
@@ -42,10 +41,7 @@ class Thinned:
     @classmethod
     def of(cls, points: np.ndarray, config: Config) -> "Thinned":
         """Of the points (N, 3) in range, thinned to the wanted voxel, to a smaller one in a small place."""
-        usable = points[preparation.usable(points, config.preparation)]
-        voxel_m = voxel_for(usable, config.ego.voxel_m)
-        means = thinned(usable, voxel_m)
-        return cls(means, Planes.of(means, voxel_m), voxel_m)
+        return cls(*Planes.in_range(points, config.preparation, config.ego.voxel_m))
 
 
 def find(source: Thinned, target: Thinned, guess: np.ndarray | None, config: EgoConfig) -> np.ndarray:

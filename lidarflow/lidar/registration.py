@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarflow import pose
+from lidarflow.config import PreparationConfig
 from lidarflow.errors import DataError
-from lidarflow.kernels import grid, icp, neighbours, normals, tree
+from lidarflow.kernels import grid, icp, neighbours, thinning
 from lidarflow.kernels import registration as kernel
 from lidarflow.kernels.tree import Tree
 from lidarflow.open3d_import import open3d
@@ -34,12 +35,16 @@ def voxel_for(points: np.ndarray, wanted_m: float) -> float:
 def thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
     """Points (N, 3) averaged per voxel (M, 3); DataError where too few are left."""
     found = grid.means(points, voxel_m) if voxel_m > 0 else points
+    _require_enough(found, len(points), voxel_m)
+    return found
+
+
+def _require_enough(found: np.ndarray, count: int, voxel_m: float) -> None:
     if len(found) < _MIN_POINTS:
         raise DataError(
-            f"registration: a scan has {len(points)} points in range, {len(found)} after thinning to "
+            f"registration: a scan has {count} points in range, {len(found)} after thinning to "
             f"{voxel_m:.2g} m, and registration needs {_MIN_POINTS}; is the scan complete and in metres, is "
             "preparation.min_range_m too large for the place?")
-    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,8 +57,21 @@ class Planes:
     @classmethod
     def of(cls, points: np.ndarray, voxel_m: float) -> "Planes":
         """Of points (N, 3) in metres, thinned to `voxel_m`."""
-        grown = tree.build(points)
-        return cls(grown, normals.estimate(grown.points, grown.points, _NORMAL_RADIUS_VOXELS * voxel_m))
+        return cls(*thinning.planes(np.ascontiguousarray(points), _NORMAL_RADIUS_VOXELS * voxel_m))
+
+    @classmethod
+    def in_range(
+        cls, points: np.ndarray, limits: PreparationConfig, wanted_m: float
+    ) -> "tuple[np.ndarray, Planes, float]":
+        """Those in range of points (N, 3), thinned (M, 3); a cloud of these; and the voxel, as `voxel_for`.
+
+        Raises DataError where too few are left.
+        """
+        means, tree, normals, voxel_m, count = thinning.thinned(
+            np.ascontiguousarray(points), limits.min_range_m, limits.max_range_m, wanted_m, _SCENE_VOXEL_SHARE,
+            _NORMAL_RADIUS_VOXELS)
+        _require_enough(means, count, voxel_m)
+        return means, cls(tree, normals), voxel_m
 
 
 def robust_point_to_plane(

@@ -80,11 +80,10 @@ def _std(
     if len(at):
         size = np.abs(off_m)
         kept = size <= _TRIMMED * max(float(np.median(size)), _LEAST_STD_M)
-        at, normals, off_m = at[kept] - centre, normals[kept], off_m[kept]
+        at, normals, off_m = at[kept], normals[kept], off_m[kept]
         variance = max(float((off_m**2).mean()), _LEAST_STD_M**2)
-        cell, count = grid.voxels(at, _CELL_M)
-        rows = np.hstack([np.cross(at, normals), normals])
-        information += (rows / (count[cell] * variance)[:, None]).T @ rows
+        cell, count = grid.voxels(at - centre, _CELL_M)
+        information += deviation.information(at, normals, centre, 1.0 / (count[cell] * variance))
     for direction in held:
         row = np.concatenate([np.zeros(3), direction])
         information += np.outer(row, row) / _LEAST_STD_M**2
