@@ -18,6 +18,7 @@ from lidarflow.lidar import (
     ego,
     features,
     frontend,
+    limbs,
     mesh,
     preparation,
     refinement,
@@ -151,8 +152,9 @@ class Prepared:
     """A pair up to the question what moves: features, ego-motion, meshes, and the graph.
 
     `tracks` are what earlier pairs lead to expect; `search`, where to look for objects, is None when they are
-    not looked for. The graph then has its matches, else none yet, and `matches` finds them. The mesh of the
-    target, None where nothing is refined, may still be under way.
+    not looked for. The graph then has its matches, else none yet, and `matches` finds them. What is
+    refined needs the mesh of the target and the scene of limbs; when objects are looked for, what may have
+    limbs is refined as part of the world meanwhile. These may still be under way, or None.
     """
 
     pair: ScanPair
@@ -161,6 +163,8 @@ class Prepared:
     ego_motion: np.ndarray
     mesh: Mesh
     target_mesh: "Future[Mesh] | None"
+    scene: "Future[limbs.Scene] | None"
+    world_limbs: "Future[limbs.Part] | None"
     tracks: Tracks
     search: Search | None
     graph: frontend.Graph
@@ -192,8 +196,13 @@ def prepare(
     target_mesh = beside.begin(_mesh, pair.target, target, config) if config.refine.rounds else None
     with timed("ego-motion"):
         ego_motion = ego.find(source.thinned, target.thinned, guess.result() if guess else None, config.ego)
+    scene = world_limbs = None
+    if target_mesh:
+        scene = beside.begin(_scene, pair.target, target, begun_graph, target_mesh, config)
     tracks, search = tracks or Tracks(), None
     if config.objects.enabled:
+        if scene:
+            world_limbs = beside.begin(_world_limbs, scene, ego_motion)
         with timed("features"):
             target.begun_cloud.result()
         with timed("evidence"):
@@ -210,8 +219,8 @@ def prepare(
         with timed("matching"):
             graph = frontend.matched(frontend.started(graph, start_at), *matches.of(graph.rows))
     return Prepared(
-        pair, source, target, ego_motion, source_mesh, target_mesh, tracks, search, graph, matches,
-        timed.seconds)
+        pair, source, target, ego_motion, source_mesh, target_mesh, scene, world_limbs, tracks, search, graph,
+        matches, timed.seconds)
 
 
 def _mesh(scan: Scan, seen: features.Features, config: Config) -> Mesh:
@@ -220,6 +229,20 @@ def _mesh(scan: Scan, seen: features.Features, config: Config) -> Mesh:
 
 def _graph(points: np.ndarray, mesh: "Future[Mesh]", config: Config) -> frontend.Graph:
     return frontend.build(points, mesh.result(), config.graph.thinning_m)
+
+
+def _scene(
+    target: Scan, seen: features.Features, graph: "Future[frontend.Graph]", mesh: "Future[Mesh]",
+    config: Config,
+) -> limbs.Scene:
+    return limbs.Scene(
+        graph.result(), refinement.wanted(graph.result().problem, config.refine), target.points,
+        np.flatnonzero(seen.standing), seen.cloud.upright.tree, mesh.result(),
+        partial(solve, min_matches=config.graph.min_matches), config)
+
+
+def _world_limbs(scene: "Future[limbs.Scene]", ego_motion: np.ndarray) -> limbs.Part:
+    return limbs.of_world(scene.result(), ego_motion)
 
 
 def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
@@ -239,16 +262,18 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
         by_group = np.concatenate([found.motions, ego_motion[None]])   # WORLD is the last
     with timed("solver"):
         motions, solved, stats = solve(graph.problem, config.solver, config.graph.min_matches)
-    with timed("mesh"):
-        target_mesh = prepared.target_mesh.result() if prepared.target_mesh else None
+        whole = limbs.Part(graph, motions)
     with timed("refinement"):
-        near_things, refined = _refined(prepared, target_mesh, graph, motions, by_group, found, config)
+        refined = _refined(prepared, whole, found, config)
     with timed("dense answer"):
-        in_graph = (graph.variable >= 0) | (near_things.variable >= 0)
-        dense, moved = _dense(points, by_group, found.owner, ((graph, motions), (near_things, refined)))
+        is_refined = np.zeros(len(points), bool)
+        for part in refined:
+            is_refined |= part.graph.variable >= 0
+        in_graph = is_refined | (graph.variable >= 0)
+        dense, moved = _dense(points, by_group, found.owner, (whole, *refined))
         flow = moved - points
         std_m = _std(points, found, graph, motions, solved, in_graph, flow, by_group, config)
-        is_solved = (near_things.variable >= 0) | np.append(solved, False)[graph.variable]
+        is_solved = is_refined | np.append(solved, False)[graph.variable]
         is_solved &= np.isfinite(std_m)     # what let all its matches go rests on none of them
         is_dynamic = found.owner != WORLD
         if not prepared.search:
@@ -268,20 +293,20 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
 
 def _dense(
     points: np.ndarray, by_group: np.ndarray, owner: np.ndarray,
-    parts: tuple[tuple[frontend.Graph, np.ndarray], ...],
+    parts: tuple[limbs.Part, ...],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motions (N, 4, 4) of points (N, 3), and where they go (N, 3).
 
     Each point has the motion of its group, by_group (G + 1, 4, 4), the last being the world's, unless it is
-    in a part of the graph, with variables that have their own (M, 4, 4); the last part counts.
+    in a part of the graph, whose variables have their own; the last part counts.
     """
     motions = np.empty((len(points), 4, 4))
     motions[:] = by_group[WORLD]
     has_own = owner != WORLD
     motions[has_own] = by_group[owner[has_own]]
-    for graph, of_variables in parts:
-        rows = np.flatnonzero(graph.variable >= 0)
-        motions[rows] = of_variables[graph.variable[rows]]
+    for part in parts:
+        rows = np.flatnonzero(part.graph.variable >= 0)
+        motions[rows] = part.motions[part.graph.variable[rows]]
         has_own[rows] = True
     moved = pose.apply(by_group[WORLD], points)
     moved[has_own] = pose.apply(motions[has_own], points[has_own])
@@ -289,29 +314,20 @@ def _dense(
 
 
 def _refined(
-    prepared: Prepared, target_mesh: Mesh | None, graph: frontend.Graph, solved: np.ndarray,
-    by_group: np.ndarray, found: Attribution, config: Config,
-) -> tuple[frontend.Graph, np.ndarray]:
-    """The part of the graph that may have limbs, and its motions (M, 4, 4) on the next scan's surface.
-
-    They begin at what was `solved` for the variables (V, 4, 4) of `graph`, elsewhere at the group's motion.
-    """
-    pair, target, limits = prepared.pair, prepared.target, config.refine
-    is_rigid = np.array([*(o.box_size.max() > limits.max_size_m for o in found.objects), False])
-    owner = frontend.owners(prepared.graph, found.owner)
-    kept = refinement.wanted(prepared.graph.problem, is_rigid[owner], limits)
-    part = frontend.tied(prepared.graph, kept, found.owner, found.motions, prepared.ego_motion)
-    motions, variable = by_group[found.owner[part.rows]], graph.variable[part.rows]
-    motions[variable >= 0] = solved[variable[variable >= 0]]
-    if len(motions) and target_mesh is not None:
-        surface = refinement.Surface.around(
-            pose.apply(motions, part.problem.points), pair.target.points,
-            np.flatnonzero(target.standing), target.cloud.upright.tree, target_mesh)
-        motions = refinement.refined(
-            part.problem, motions, surface,
-            lambda problem, settings: solve(problem, settings, config.graph.min_matches),
-            refinement.solver(config.solver, limits), limits)
-    return part, motions
+    prepared: Prepared, solved: limbs.Part, found: Attribution, config: Config
+) -> tuple[limbs.Part, ...]:
+    """The parts of the graph that may have limbs, on the next scan's surface, from what was `solved`."""
+    if prepared.scene is None:
+        return ()
+    scene = prepared.scene.result()
+    is_rigid = np.array([o.box_size.max() > config.refine.max_size_m for o in found.objects], bool)
+    touched = np.ones(len(scene.wanted), bool)
+    apart: tuple[limbs.Part, ...] = ()
+    if prepared.world_limbs is not None:
+        touched = frontend.touched(scene.graph, found.owner)
+        apart = limbs.apart_from(prepared.world_limbs.result(), scene.graph, touched),
+    return *apart, limbs.of_objects(
+        scene, touched, solved, found.owner, found.motions, is_rigid, prepared.ego_motion)
 
 
 def _std(

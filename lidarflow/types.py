@@ -168,7 +168,7 @@ class FlowProblem:
                 raise ValueError(f"FlowProblem.{name}: indices must lie in 0..{m - 1}")
         if len(self.edges) and not (self.edges[:, 0] < self.edges[:, 1]).all():
             raise ValueError("FlowProblem.edges: expected i < j in every row")
-        if len(np.unique(self.match_index)) != len(self.match_index):
+        if np.bincount(self.match_index).max(initial=0) > 1:
             raise ValueError("FlowProblem.match_index: a variable has more than one match")
 
     def part(self, rows: np.ndarray) -> "FlowProblem":

@@ -39,8 +39,9 @@ def planes(points, normal_radius_m):
 
 @njit()
 def thinned(points, min_range_m, max_range_m, voxel_m, scene_share, radius_voxels):
-    """What is in range of points (N, 3), averaged per voxel (M, 3); its `planes`; the voxel in metres; how many were in range.
+    """What is in range of points (N, 3), averaged per voxel (M, 3), and its `planes`.
 
+    Returns the voxel in metres and how many points were in range as well.
     A voxel is at most `scene_share` of the median range, normals are fitted within `radius_voxels` of them.
     """
     kept, median_m = in_range(points, min_range_m, max_range_m)

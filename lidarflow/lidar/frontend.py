@@ -78,9 +78,20 @@ def focused(
     object_id (N,), -1 = none; object_motions (G, 4, 4) and ego_motion (4, 4), target_from_source. Mesh
     components without a point on an object follow the ego-motion: ego-motion explains them.
     """
+    return tied(graph, touched(graph, object_id), object_id, object_motions, ego_motion)
+
+
+def touched(graph: Graph, object_id: np.ndarray) -> np.ndarray:
+    """Which variables (M,) are in a component with a point on an object, those of points being (N,)."""
+    return components_with(graph, owners(graph, object_id) >= 0)
+
+
+def components_with(graph: Graph, marked: np.ndarray) -> np.ndarray:
+    """Which variables (M,) are in a component with one of the `marked` (M,)."""
     component = graph.problem.component
-    touched = np.isin(component, component[owners(graph, object_id) >= 0])
-    return tied(graph, touched, object_id, object_motions, ego_motion)
+    has_one = np.zeros(component.max(initial=-1) + 1, bool)
+    has_one[component[marked]] = True
+    return has_one[component]
 
 
 def tied(

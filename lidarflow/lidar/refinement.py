@@ -100,11 +100,10 @@ def solver(config: SolverConfig, limits: RefineConfig) -> SolverConfig:
         tie_weight=limits.tie_weight, tie_truncation=limits.tie_truncation)
 
 
-def wanted(problem: FlowProblem, is_rigid: np.ndarray, config: RefineConfig) -> np.ndarray:
-    """Which variables (M,) of a graph are refined: components that are near and no larger than a person.
+def wanted(problem: FlowProblem, config: RefineConfig) -> np.ndarray:
+    """Which variables (M,) of a graph may have limbs: components that are near and no larger than a person.
 
-    What is larger is a wall, a hedge, or a car; so is a fragment with a variable on such a rigid object,
-    `is_rigid` (M,). What is far is seen by too few scan lines.
+    What is larger is a wall, a hedge, or a car. What is far is seen by too few scan lines.
     """
     order = np.argsort(problem.component, kind="stable")
     first = np.flatnonzero(np.diff(problem.component[order], prepend=-1))
@@ -114,4 +113,4 @@ def wanted(problem: FlowProblem, is_rigid: np.ndarray, config: RefineConfig) -> 
     size_m = np.maximum.reduceat(ordered, first) - np.minimum.reduceat(ordered, first)
     nearest_m = np.minimum.reduceat(np.linalg.norm(ordered, axis=1), first)
     small = (size_m <= config.max_size_m).all(axis=1) & (nearest_m <= config.max_range_m)
-    return (small & ~np.logical_or.reduceat(is_rigid[order], first))[problem.component]
+    return small[problem.component]

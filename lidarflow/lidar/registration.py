@@ -68,8 +68,8 @@ class Planes:
         Raises DataError where too few are left.
         """
         means, tree, normals, voxel_m, count = thinning.thinned(
-            np.ascontiguousarray(points), limits.min_range_m, limits.max_range_m, wanted_m, _SCENE_VOXEL_SHARE,
-            _NORMAL_RADIUS_VOXELS)
+            np.ascontiguousarray(points), limits.min_range_m, limits.max_range_m, wanted_m,
+            _SCENE_VOXEL_SHARE, _NORMAL_RADIUS_VOXELS)
         _require_enough(means, count, voxel_m)
         return means, cls(tree, normals), voxel_m
 
