@@ -1,15 +1,20 @@
 """Work beside the thread that asks for it: two cores are rarely both busy with one kernel after the other."""
 
 import contextlib
+import itertools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import ParamSpec, TypeVar
 
 import numba
 
 P = ParamSpec("P")
+S = TypeVar("S")
 T = TypeVar("T")
+
+# Answers of a function to each of some items, in their order.
+Each = Callable[[Callable[[S], T], Sequence[S]], list[T]]
 
 
 # Threads with nothing to do. A new one every time would bring new threads for its kernels, and memory of its
@@ -61,6 +66,31 @@ class Aside:
             return done(function, *given, **named)
         begun = self._last = self._thread.submit(function, *given, **named)
         return begun
+
+    def each(self, function: Callable[[S], T], items: Sequence[S]) -> list[T]:
+        """The function of each item, in their order; the other thread takes some when it comes to them.
+
+        What the function raises is raised here, once nothing is under way.
+        """
+        answers: list = [None] * len(items)
+        waiting = itertools.count()
+
+        def take() -> None:
+            while (number := next(waiting)) < len(items):
+                answers[number] = function(items[number])
+
+        begun = self.begin(take)
+        try:
+            take()
+        finally:
+            if not begun.cancel():     # it has begun to take some
+                begun.result()
+        return answers
+
+
+def one_by_one(function: Callable[[S], T], items: Sequence[S]) -> list[T]:
+    """As Aside.each, by the caller alone."""
+    return [function(item) for item in items]
 
 
 def done(function: Callable[P, T], *given: P.args, **named: P.kwargs) -> "Future[T]":

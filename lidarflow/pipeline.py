@@ -81,7 +81,7 @@ def estimate_flow(
         source, target = pair
         pair = ScanPair(as_scan(source, "source"), as_scan(target, "target"))
     with Aside() as beside:
-        result, _ = explain(prepare(pair, config, beside), config)
+        result, _ = explain(prepare(pair, config, beside), config, beside)
     return result
 
 
@@ -120,7 +120,7 @@ class FlowEstimator:
             prepared = prepare(
                 pair, self.config, beside, previous, lambda: self._odometry.step(scan.points, pair.dt_s),
                 tracks)
-            result, self.tracks = explain(prepared, self.config)
+            result, self.tracks = explain(prepared, self.config, beside)
         self._odometry.found(result.ego_motion, pair.dt_s)
         self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh)
         return result
@@ -245,8 +245,8 @@ def _world_limbs(scene: "Future[limbs.Scene]", ego_motion: np.ndarray) -> limbs.
     return limbs.of_world(scene.result(), ego_motion)
 
 
-def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
-    """The result of a prepared pair, and the tracks of its objects."""
+def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResult, Tracks]:
+    """The result of a prepared pair, and the tracks of its objects; candidates are judged `beside` too."""
     pair, source, graph, ego_motion = prepared.pair, prepared.source, prepared.graph, prepared.ego_motion
     timed = Stopwatch(dict(prepared.seconds))
     points = pair.source.points
@@ -254,7 +254,7 @@ def explain(prepared: Prepared, config: Config) -> tuple[FlowResult, Tracks]:
         found = Attribution.none(len(points))
         if prepared.search:
             found = attribution.attribute(
-                pair, prepared.search, prepared.matches, ego_motion, prepared.tracks, config)
+                pair, prepared.search, prepared.matches, ego_motion, prepared.tracks, config, beside.each)
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
             # Around objects, matches would say what ego-motion says already.
             moving = np.flatnonzero(found.owner != WORLD)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarflow import pose
+from lidarflow.aside import Each, one_by_one
 from lidarflow.config import Config
 from lidarflow.kernels import tree
 from lidarflow.lidar import objects, seeds, tracking, uncertainty
@@ -77,9 +78,13 @@ def search(
 
 
 def attribute(
-    pair: ScanPair, sought: Search, matches: Matches, ego_motion: np.ndarray, tracks: Tracks, config: Config
+    pair: ScanPair, sought: Search, matches: Matches, ego_motion: np.ndarray, tracks: Tracks, config: Config,
+    each: Each = one_by_one,
 ) -> Attribution:
-    """Find the moving objects of a pair; `tracks` are of the pair before, in the frame of the source."""
+    """Find the moving objects of a pair; `tracks` are of the pair before, in the frame of the source.
+
+    `each` does the same to several things, at once if it can.
+    """
     points, rows = pair.source.points, sought.rows
 
     def of_view(asked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +92,7 @@ def attribute(
         return np.searchsorted(rows, found), places
 
     view = replace(sought.view, matches=of_view)
-    bodies = objects.find(view, sought.seeds, pair.dt_s, config.objects, sought.expected)
+    bodies = objects.find(view, sought.seeds, pair.dt_s, config.objects, sought.expected, each)
 
     owner, explained = np.full(len(points), WORLD), np.zeros(len(points), bool)
     explained[rows] = ~(view.evidence.unexplained | view.evidence.blind)

@@ -42,7 +42,7 @@ class Growth:
     """How a body grew.
 
     body   Body or None   None if it stayed too small
-    asked  (N,) bool      the rows of the view that were asked whether they agree
+    asked  (N,) bool      the rows of the view that were asked whether they belong to it
     """
 
     body: Body | None
@@ -78,18 +78,22 @@ def grown(
             for rows, motion, own_did in zip(taken, motions, did, strict=True)]
 
 
-def completed(view: View, body: Body, free: np.ndarray) -> Body:
-    """The body with the points it surrounds and the fragments that follow it; `free` (N,) may be taken.
+def completed(view: View, growth: Growth, free: np.ndarray) -> Growth:
+    """A growth whose body has the points it surrounds and the fragments that follow it, those `free` (N,).
 
     A mesh or a linkage cuts a body at its glass and its edges; what lies amid its points or moves along
     close by is a part of it.
     """
-    on_body = np.zeros(len(view.points), bool)
+    body = growth.body
+    if body is None:
+        return growth
+    on_body, asked = np.zeros(len(view.points), bool), growth.asked.copy()
     on_body[body.rows] = True
     near = near_rows(view, body.rows, _FRAGMENT_M)
+    asked[near] = True
     near = near[free[near] & ~on_body[near]]
     if len(near) == 0:
-        return body
+        return Growth(body, asked)
     after, by_ego = view.after(near, body.over_ground), view.by_ego.distance_m[near]
     follows = (after.distance_m <= view.tolerance_m[near])
     follows &= (after.distance_m < by_ego - _CLEARLY_BETTER_M) & view.evidence.unexplained[near]
@@ -97,7 +101,7 @@ def completed(view: View, body: Body, free: np.ndarray) -> Body:
     # Twice: what the first round adds surrounds others.
     for _ in range(2):
         on_body[near[_surrounded(view, on_body, near)]] = True
-    return Body(np.flatnonzero(on_body), body.over_ground)
+    return Growth(Body(np.flatnonzero(on_body), body.over_ground), asked)
 
 
 def near_rows(view: View, rows: np.ndarray, radius_m: float) -> np.ndarray:

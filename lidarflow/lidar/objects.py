@@ -1,10 +1,12 @@
 """Moving objects: neighbouring points with one rigid motion that clearly beats ego-motion."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from lidarflow import pose
+from lidarflow.aside import Each, one_by_one
 from lidarflow.config import ObjectsConfig
 from lidarflow.kernels import misfit as misfit_kernel
 from lidarflow.lidar import body, hypotheses, rigid_fit, seeds
@@ -22,21 +24,20 @@ _MAX_START_POINTS = 300  # as many choose the start; the fit that follows uses a
 
 def find(
     view: View, found: seeds.Seeds, dt_s: float, config: ObjectsConfig,
-    expected: hypotheses.Expected = hypotheses.NONE,
+    expected: hypotheses.Expected = hypotheses.NONE, each: Each = one_by_one,
 ) -> list[Body]:
     """The moving objects of a view, sought at seeds; no point belongs to two, the best supported come first.
 
     `expected` is what earlier pairs lead to expect: it is looked for where it should be, and believed no
-    more easily than the rest.
+    more easily than the rest. `each` judges candidates, several at a time if it can.
     """
     starts = _best_starts(view, found, found.clusters, expected)
     bodies, free = [], np.ones(len(view.points), bool)
-    # All grow at once, as if each were alone; who meets what another has taken grows again.
+    # All are looked at as if each were alone; who meets what another has taken is looked at again.
     moving = [number for number, start in enumerate(starts) if start is not None]
     alone = dict(zip(moving, _candidates(
         view, [found.rows[found.clusters[number]] for number in moving],
-        [starts[number] for number in moving], free, dt_s, config), strict=True))
-    _match_at_once(view, list(alone.values()))
+        [starts[number] for number in moving], free, dt_s, config, each), strict=True))
     taken = np.empty(0, np.int64)
     for number, (cluster, start) in enumerate(zip(found.clusters, starts, strict=True)):
         mine = cluster[free[found.rows[cluster]]]
@@ -46,32 +47,42 @@ def find(
             continue
         candidate = alone.get(number)
         if candidate is None or len(mine) < len(cluster) or candidate.asked[taken].any():
-            candidate, = _candidates(view, [found.rows[mine]], [start], free, dt_s, config)
-        if candidate.body is None or not matches_agree(view, candidate.body, config):
-            continue
-        whole = body.completed(view, candidate.body, free)
-        # What a body surrounds must not speak against it.
-        if moves(view, whole, dt_s, config):
-            bodies.append(whole)
-            free[whole.rows] = False
+            candidate, = _candidates(view, [found.rows[mine]], [start], free, dt_s, config, each)
+        if candidate.body is not None:
+            bodies.append(candidate.body)
+            free[candidate.body.rows] = False
             taken = np.flatnonzero(~free)
     return bodies
 
 
 def _candidates(
     view: View, seeds: list[np.ndarray], starts: list[np.ndarray], free: np.ndarray, dt_s: float,
-    config: ObjectsConfig,
+    config: ObjectsConfig, each: Each,
 ) -> list[Growth]:
-    """What grows of seeds, rows (K,) each; bodies that anything but matches speaks against are left out."""
-    return [
-        growth if growth.body is not None and seems_to_move(view, growth.body, dt_s, config)
-        else replace(growth, body=None)
-        for growth in body.grown(view, seeds, starts, free, config)]
+    """What grows of seeds, rows (K,) each, over the rows that are `free` (N,), and moves."""
+    grown = body.grown(view, seeds, starts, free, config)
+    grown = _those(grown, lambda own: seems_to_move(view, own, dt_s, config), each)
+    _match_at_once(view, grown)
+    grown = _those(grown, lambda own: matches_agree(view, own, config), one_by_one)
+    grown = each(lambda growth: body.completed(view, growth, free), grown)
+    _match_at_once(view, grown)
+    # What a body surrounds must not speak against it.
+    return _those(grown, lambda own: moves(view, own, dt_s, config), each)
 
 
-def _match_at_once(view: View, candidates: list[Growth]) -> None:
+def _those(growths: list[Growth], holds: Callable[[Body], bool], each: Each) -> list[Growth]:
+    """The growths, without the bodies for which something does not hold."""
+    there = [number for number, growth in enumerate(growths) if growth.body is not None]
+    kept = list(growths)
+    for number, answer in zip(there, each(holds, [growths[number].body for number in there]), strict=True):
+        if not answer:
+            kept[number] = replace(growths[number], body=None)
+    return kept
+
+
+def _match_at_once(view: View, growths: list[Growth]) -> None:
     """Have the view find matches that will be asked for one body after the other: together they take less."""
-    rows = [candidate.body.rows for candidate in candidates if candidate.body is not None]
+    rows = [growth.body.rows for growth in growths if growth.body is not None]
     if rows:
         view.matches(np.concatenate(rows))
 
