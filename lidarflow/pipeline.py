@@ -155,6 +155,7 @@ class Prepared:
     not looked for. The graph then has its matches, else none yet, and `matches` finds them. What is
     refined needs the mesh of the target and the scene of limbs; when objects are looked for, what may have
     limbs is refined as part of the world meanwhile. These may still be under way, or None.
+    `by_world` is what the dense answer is for points that move with the world.
     """
 
     pair: ScanPair
@@ -163,6 +164,7 @@ class Prepared:
     ego_motion: np.ndarray
     mesh: Mesh
     target_mesh: "Future[Mesh] | None"
+    by_world: "Future[tuple[np.ndarray, np.ndarray]]"
     scene: "Future[limbs.Scene] | None"
     world_limbs: "Future[limbs.Part] | None"
     tracks: Tracks
@@ -200,9 +202,10 @@ def prepare(
     if target_mesh:
         scene = beside.begin(_scene, pair.target, target, begun_graph, target_mesh, config)
     tracks, search = tracks or Tracks(), None
+    if config.objects.enabled and scene:
+        world_limbs = beside.begin(_world_limbs, scene, ego_motion)
+    by_world = beside.begin(_by_world, points, ego_motion)
     if config.objects.enabled:
-        if scene:
-            world_limbs = beside.begin(_world_limbs, scene, ego_motion)
         with timed("features"):
             target.begun_cloud.result()
         with timed("evidence"):
@@ -219,8 +222,8 @@ def prepare(
         with timed("matching"):
             graph = frontend.matched(frontend.started(graph, start_at), *matches.of(graph.rows))
     return Prepared(
-        pair, source, target, ego_motion, source_mesh, target_mesh, scene, world_limbs, tracks, search, graph,
-        matches, timed.seconds)
+        pair, source, target, ego_motion, source_mesh, target_mesh, by_world, scene, world_limbs, tracks,
+        search, graph, matches, timed.seconds)
 
 
 def _mesh(scan: Scan, seen: features.Features, config: Config) -> Mesh:
@@ -241,6 +244,13 @@ def _scene(
         partial(solve, min_matches=config.graph.min_matches), config)
 
 
+def _by_world(points: np.ndarray, ego_motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Motions (N, 4, 4) of points (N, 3) that move with the world, and where they go (N, 3)."""
+    motions = np.empty((len(points), 4, 4))
+    motions[:] = ego_motion
+    return motions, pose.apply(ego_motion, points)
+
+
 def _world_limbs(scene: "Future[limbs.Scene]", ego_motion: np.ndarray) -> limbs.Part:
     return limbs.of_world(scene.result(), ego_motion)
 
@@ -254,7 +264,7 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
         found = Attribution.none(len(points))
         if prepared.search:
             found = attribution.attribute(
-                pair, prepared.search, prepared.matches, ego_motion, prepared.tracks, config, beside.each)
+                pair, prepared.search, prepared.matches, ego_motion, prepared.tracks, config, beside)
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
             # Around objects, matches would say what ego-motion says already.
             moving = np.flatnonzero(found.owner != WORLD)
@@ -270,7 +280,7 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
         for part in refined:
             is_refined |= part.graph.variable >= 0
         in_graph = is_refined | (graph.variable >= 0)
-        dense, moved = _dense(points, by_group, found.owner, (whole, *refined))
+        dense, moved = _dense(points, prepared.by_world.result(), by_group, found.owner, (whole, *refined))
         flow = moved - points
         std_m = _std(points, found, graph, motions, solved, in_graph, flow, by_group, config)
         is_solved = is_refined | np.append(solved, False)[graph.variable]
@@ -292,23 +302,21 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
 
 
 def _dense(
-    points: np.ndarray, by_group: np.ndarray, owner: np.ndarray,
+    points: np.ndarray, by_world: tuple[np.ndarray, np.ndarray], by_group: np.ndarray, owner: np.ndarray,
     parts: tuple[limbs.Part, ...],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motions (N, 4, 4) of points (N, 3), and where they go (N, 3).
 
-    Each point has the motion of its group, by_group (G + 1, 4, 4), the last being the world's, unless it is
-    in a part of the graph, whose variables have their own; the last part counts.
+    Both are filled in where a point does not move `by_world`: it has the motion of its group, by_group
+    (G, 4, 4), unless it is in a part of the graph, whose variables have their own; the last part counts.
     """
-    motions = np.empty((len(points), 4, 4))
-    motions[:] = by_group[WORLD]
+    motions, moved = by_world
     has_own = owner != WORLD
     motions[has_own] = by_group[owner[has_own]]
     for part in parts:
         rows = np.flatnonzero(part.graph.variable >= 0)
         motions[rows] = part.motions[part.graph.variable[rows]]
         has_own[rows] = True
-    moved = pose.apply(by_group[WORLD], points)
     moved[has_own] = pose.apply(motions[has_own], points[has_own])
     return motions, moved
 

@@ -1,11 +1,12 @@
 """What every point of a pair moves with: the static world, or one of the moving objects."""
 
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.aside import Each, one_by_one
+from lidarflow.aside import Aside, there
 from lidarflow.config import Config
 from lidarflow.kernels import tree
 from lidarflow.lidar import objects, seeds, tracking, uncertainty
@@ -30,7 +31,8 @@ class Attribution:
     motions    (G, 4, 4)        of the objects, target_from_source
     ids        (G,) int32       of the objects, kept over time
     explained  (N,) bool        an object's motion or the ego-motion explains the point
-    std_m      (N,) float64     standard deviation of where that motion puts the point, metres
+    std_m      (N,) float64     standard deviation of where that motion puts the point, metres; may still be
+                                under way
     objects    tuple            the objects, described
     tracks     Tracks           for the next pair
     """
@@ -39,15 +41,19 @@ class Attribution:
     motions: np.ndarray
     ids: np.ndarray
     explained: np.ndarray
-    std_m: np.ndarray
+    begun_std_m: "Future[np.ndarray]"
     objects: tuple[MovingObject, ...]
     tracks: Tracks
+
+    @property
+    def std_m(self) -> np.ndarray:
+        return self.begun_std_m.result()
 
     @classmethod
     def none(cls, count: int) -> "Attribution":
         """All `count` points with the world, nothing explained, nothing known of any error."""
         return cls(np.full(count, WORLD), np.empty((0, 4, 4)), np.empty(0, np.int32), np.zeros(count, bool),
-                   np.full(count, np.nan), (), Tracks())
+                   there(np.full(count, np.nan)), (), Tracks())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,11 +85,11 @@ def search(
 
 def attribute(
     pair: ScanPair, sought: Search, matches: Matches, ego_motion: np.ndarray, tracks: Tracks, config: Config,
-    each: Each = one_by_one,
+    beside: Aside,
 ) -> Attribution:
     """Find the moving objects of a pair; `tracks` are of the pair before, in the frame of the source.
 
-    `each` does the same to several things, at once if it can.
+    Candidates are judged `beside` the caller too, and standard deviations there alone.
     """
     points, rows = pair.source.points, sought.rows
 
@@ -92,13 +98,14 @@ def attribute(
         return np.searchsorted(rows, found), places
 
     view = replace(sought.view, matches=of_view)
-    bodies = objects.find(view, sought.seeds, pair.dt_s, config.objects, sought.expected, each)
+    bodies = objects.find(view, sought.seeds, pair.dt_s, config.objects, sought.expected, beside.each)
 
     owner, explained = np.full(len(points), WORLD), np.zeros(len(points), bool)
     explained[rows] = ~(view.evidence.unexplained | view.evidence.blind)
     for index, body in enumerate(bodies):
         owner[rows[body.rows]] = index
         explained[rows[body.rows]] = True
+    std_m = beside.begin(_std, points, rows, owner, bodies, view, ego_motion, config)
     clouds = [points[rows[body.rows]] for body in bodies]
     over_ground = [body.over_ground for body in bodies]
     motions = [motion @ ego_motion for motion in over_ground]
@@ -107,9 +114,8 @@ def attribute(
         objects.describe(number, cloud, motion, ego_motion, pair.dt_s)
         for number, cloud, motion in zip(ids, clouds, motions, strict=True))
     return Attribution(
-        owner, np.array(motions).reshape(-1, 4, 4), np.array(ids, np.int32), explained,
-        _std(points, rows, owner, bodies, view, ego_motion, config), described,
-        tracking.advance(tracks, ids, clouds, over_ground, ego_motion))
+        owner, np.array(motions).reshape(-1, 4, 4), np.array(ids, np.int32), explained, std_m,
+        described, tracking.advance(tracks, ids, clouds, over_ground, ego_motion))
 
 
 def _expected(tracks: Tracks, ego_motion: np.ndarray) -> Expected:
