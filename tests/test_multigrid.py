@@ -163,7 +163,32 @@ def test_steps_solve_the_normal_equations(at_sensor):
     count = len(matrix) // 6
     gradient = rng(6).normal(size=(count, 6))
     for c in range(3):
-        assert multigrid.solve(levels, room, c, gradient, 1e-24, 0.0, 200) < 60
+        assert multigrid.solve(levels, room, c, gradient, 1e-24, 0.0, 0.0, 200) < 60
     expected = -np.linalg.solve(matrix, gradient.ravel()).reshape(-1, 6)
     assert_allclose(room.step, expected, atol=1e-7 * np.abs(expected).max())
-    assert multigrid.solve(levels, room, 0, gradient, 1e-24, 1e9, 200) == -1   # not enough to gain
+    assert multigrid.solve(levels, room, 0, gradient, 1e-24, 0.0, 1e9, 200) == -1   # not enough to gain
+
+
+@pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
+@pytest.mark.parametrize("shape", [(12, 7), (1, 1)])
+def test_directions_come_with_their_product(at_sensor, shape):
+    levels, room, joined, held = prepared(at_sensor, shape)
+    count = len(levels.lever)
+    for share in (0.0, 0.3):
+        room.loads[:count] = rng(7).normal(size=(count, 6))
+        multigrid.cycle(levels, room, 0)
+        last = room.direction.copy()
+        total = multigrid._turn(levels, room, 0, count, share)
+        expected = room.twists[:count] + (share * last if share else 0.0)
+        assert_allclose(room.direction, expected, rtol=1e-12)
+        product = (joined + held) @ expected.ravel()
+        assert_allclose(room.product.ravel(), product, atol=1e-10 * np.abs(product).max())
+        assert_allclose(total, product @ expected.ravel(), rtol=1e-10)
+
+
+def test_negligible_gains_end_the_iterations():
+    levels, room, _, _ = prepared(False, (16, 9))
+    gradient = rng(6).normal(size=(len(levels.lever), 6))
+    counts = [multigrid.solve(levels, room, 0, gradient, 1e-12, little, 0.0, 200)
+              for little in (0.0, 0.01, 1e9)]
+    assert counts[0] > counts[1] > counts[2] == 0

@@ -11,9 +11,11 @@ from lidarflow.kernels.hierarchy import weigh
 
 # Where an iteration gains less than relative_tolerance of the energy, or absolute_tolerance, it is the last,
 # unless the kernel let go or took back a match or a tie: then the next one may gain more. The others are
-# those of multigrid.solve.
+# those of multigrid.solve, with what is negligible as a share of the gain below which an iteration is the
+# last.
 Limits = namedtuple("Limits", (
-    "max_iterations", "relative_tolerance", "absolute_tolerance", "step_tolerance", "max_products"))
+    "max_iterations", "relative_tolerance", "absolute_tolerance", "step_tolerance", "negligible",
+    "max_products"))
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-5, 1e5, 10.0    # as in gtsam
 _SURELY_LESS = 0.03    # a cycle foresees at least this share of what there is to gain
 FIGURES = 5            # iterations, first energy, last energy, whether the limit was reached, products
@@ -86,8 +88,8 @@ def _step(factors, hierarchy, room, c, nodes, edges, limits, state, block, robus
                        factors.tie_weight, damping)
         least = max(limits.relative_tolerance * energy, limits.absolute_tolerance)
         products = multigrid.solve(
-            hierarchy, room, c, state.gradients[here], limits.step_tolerance, _SURELY_LESS * least,
-            limits.max_products)
+            hierarchy, room, c, state.gradients[here], limits.step_tolerance, limits.negligible * least,
+            _SURELY_LESS * least, limits.max_products)
         if products < 0:
             figures[0] += 1
             break

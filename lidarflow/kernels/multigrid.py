@@ -16,10 +16,11 @@ from lidarflow.kernels.rotations import cross
 _NOTHING = 1e-300    # less is not worth a step, whatever is asked for
 
 # held (N, 10): inertia that holds each node where it is (matches, ties, damping); inverse (N, 10) of the sum
-# of that and of its edges; loads (N, 6) and twists (N, 6) of a cycle; seen (M, 6) of twists; then vectors of
-# the conjugate gradients, all (M, 6).
+# of that and of its edges; loads (N, 6) and twists (N, 6) of a cycle; seen (M, 6) of twists; before (M, 6):
+# the sum of earlier neighbours' twists that a point was last solved with; then vectors of the conjugate
+# gradients, all (M, 6).
 Room = namedtuple("Room", (
-    "held", "inverse", "loads", "twists", "seen", "direction", "direction_seen", "product", "step"))
+    "held", "inverse", "loads", "twists", "seen", "before", "direction", "product", "step"))
 
 
 def room_for(hierarchy) -> Room:
@@ -133,12 +134,13 @@ def _points_up(hierarchy, room, first, last):
     """Add the coarser level's twists to those of points, then a Gauss-Seidel sweep in reversed order."""
     up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
     lever, parent, s = hierarchy.lever, hierarchy.parent, hierarchy.stiffness
-    inverse, loads, twists, seen = room.inverse, room.loads, room.twists, room.seen
+    inverse, loads, twists, seen, before = room.inverse, room.loads, room.twists, room.seen, room.before
     for i in range(first, last):
         for k in range(6):
             twists[i, k] += twists[parent[i], k]
     for i in range(last - 1, first - 1, -1):
         a, b, c, d, e, f = _sum(down, down_start[i], down_start[i + 1], twists)
+        _set(before, i, a, b, c, d, e, f)
         a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
         g, h, k, m, n, o = _sum(up, up_start[i], up_start[i + 1], seen)
         a, b, c, d, e, f = _loaded(loads, i, s, a + g, b + h, c + k, d + m, e + n, f + o)
@@ -220,41 +222,35 @@ def cycle(hierarchy, room, c):
 
 
 @njit(error_model="numpy")
-def _multiply(hierarchy, room, first, last):
-    """Fill `product` with the normal equations times `direction`; returns direction · product."""
-    up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
-    lever, incident, s = hierarchy.lever, hierarchy.incident, hierarchy.stiffness
-    held, direction, seen, product = room.held, room.direction, room.direction_seen, room.product
+def _turn(hierarchy, room, first, last, share):
+    """The next direction, the cycle's twists and a share of the last one, and its product with the equations.
+
+    A cycle leaves unbalanced what earlier neighbours have moved since a point was last solved: its product is
+    the loads without that. Returns the direction times its product.
+    """
+    down_start, down, lever, s = hierarchy.down_start, hierarchy.down, hierarchy.lever, hierarchy.stiffness
+    loads, twists, before = room.loads, room.twists, room.before
+    direction, product = room.direction, room.product
     total = 0.0
     for i in range(first, last):
-        ox, oy, oz = direction[i, 0], direction[i, 1], direction[i, 2]
-        vx, vy, vz = direction[i, 3], direction[i, 4], direction[i, 5]
-        a, b, c, d, e, f = _sum(down, down_start[i], down_start[i + 1], direction)
-        a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
-        g, h, k, m, n, o = _sum(up, up_start[i], up_start[i + 1], seen)
-        a, b, c, d, e, f = s * (a + g), s * (b + h), s * (c + k), s * (d + m), s * (e + n), s * (f + o)
-        g, h, k, m, n, o = inertia.wrench(incident, i, ox, oy, oz, vx, vy, vz)
-        a, b, c, d, e, f = g - a, h - b, k - c, m - d, n - e, o - f
-        g, h, k, m, n, o = inertia.wrench(held, i, ox, oy, oz, vx, vy, vz)
-        a, b, c, d, e, f = a + g, b + h, c + k, d + m, e + n, f + o
-        _set(product, i, a, b, c, d, e, f)
-        total += ox * a + oy * b + oz * c + vx * d + vy * e + vz * f
-    return total
-
-
-@njit(error_model="numpy")
-def _turn_direction(hierarchy, room, first, last, share):
-    """The next direction: the cycle's twists and a share of the last direction."""
-    lever, twists, direction, seen = hierarchy.lever, room.twists, room.direction, room.direction_seen
-    for i in range(first, last):
-        a, b, c = twists[i, 0], twists[i, 1], twists[i, 2]
-        d, e, f = twists[i, 3], twists[i, 4], twists[i, 5]
+        a, b, c, d, e, f = loads[i, 0], loads[i, 1], loads[i, 2], loads[i, 3], loads[i, 4], loads[i, 5]
+        if down_start[i] < down_start[i + 1]:
+            g, h, k, m, n, o = _sum(down, down_start[i], down_start[i + 1], twists)
+            g, h, k = g - before[i, 0], h - before[i, 1], k - before[i, 2]
+            m, n, o = m - before[i, 3], n - before[i, 4], o - before[i, 5]
+            g, h, k, m, n, o = _see(lever, i, g, h, k, m, n, o)
+            a, b, c, d, e, f = a - s * g, b - s * h, c - s * k, d - s * m, e - s * n, f - s * o
+        g, h, k = twists[i, 0], twists[i, 1], twists[i, 2]
+        m, n, o = twists[i, 3], twists[i, 4], twists[i, 5]
         if share != 0.0:
-            a, b, c = a + share * direction[i, 0], b + share * direction[i, 1], c + share * direction[i, 2]
-            d, e, f = d + share * direction[i, 3], e + share * direction[i, 4], f + share * direction[i, 5]
-        _set(direction, i, a, b, c, d, e, f)
-        a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
-        _set(seen, i, a, b, c, d, e, f)
+            a, b, c = a + share * product[i, 0], b + share * product[i, 1], c + share * product[i, 2]
+            d, e, f = d + share * product[i, 3], e + share * product[i, 4], f + share * product[i, 5]
+            g, h, k = g + share * direction[i, 0], h + share * direction[i, 1], k + share * direction[i, 2]
+            m, n, o = m + share * direction[i, 3], n + share * direction[i, 4], o + share * direction[i, 5]
+        _set(product, i, a, b, c, d, e, f)
+        _set(direction, i, g, h, k, m, n, o)
+        total += a * g + b * h + c * k + d * m + e * n + f * o
+    return total
 
 
 @njit(error_model="numpy")
@@ -274,13 +270,13 @@ def _add_all(rows, scale, others, first, last):
 
 
 @njit(error_model="numpy")
-def solve(hierarchy, room, c, gradient, tolerance, enough, most):
+def solve(hierarchy, room, c, gradient, tolerance, little, enough, most):
     """Fill `step` (M, 6) of component c with the twists that minimise the quadratic model of the energy.
 
     Conjugate gradients, until a cycle foresees less than `tolerance` of what all iterations have gained, or
-    `most` iterations. That last cycle's twists are part of the step as they are. Where less than `enough`
-    seems to be there to gain from the start, no step is made. Returns how many iterations were made, each
-    with a cycle and a product, or -1 for no step.
+    `little`, or `most` iterations. That last cycle's twists are part of the step as they are. Where less than
+    `enough` seems to be there to gain from the start, no step is made. Returns how many iterations were made,
+    each with a cycle and a product, or -1 for no step.
     """
     first, last = hierarchy.bounds[0, c], hierarchy.bounds[0, c + 1]
     loads, step, direction, product = room.loads, room.step, room.direction, room.product
@@ -294,11 +290,10 @@ def solve(hierarchy, room, c, gradient, tolerance, enough, most):
         square = _dot(loads, room.twists, first, last)
         if iteration == 0 and not 0.5 * square >= max(enough, _NOTHING):
             return -1
-        if 0.5 * square <= tolerance * gain:
+        if 0.5 * square <= max(tolerance * gain, little):
             _add_all(step, 1.0, room.twists, first, last)
             return iteration
-        _turn_direction(hierarchy, room, first, last, square / last_square if iteration else 0.0)
-        length = square / _multiply(hierarchy, room, first, last)
+        length = square / _turn(hierarchy, room, first, last, square / last_square if iteration else 0.0)
         _add_all(step, length, direction, first, last)
         _add_all(loads, -length, product, first, last)
         last_square = square

@@ -16,6 +16,7 @@ from lidarflow.solve import common
 from lidarflow.types import FlowProblem, SolveStats
 
 _STEP_TOLERANCE = 0.03    # conjugate gradients stop where less than this is left to add to their gain
+_NEGLIGIBLE = 0.03        # or less than this share of the gain below which an iteration is the last
 _MAX_PRODUCTS = 50
 
 
@@ -62,7 +63,7 @@ def _optimise(
     largest_first = np.argsort(-counts, kind="stable")
     limits = levenberg_marquardt.Limits(
         config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE, _STEP_TOLERANCE,
-        _MAX_PRODUCTS)
+        _NEGLIGIBLE, _MAX_PRODUCTS)
     figures = levenberg_marquardt.optimise_each(
         factors, levels, multigrid.room_for(levels), edge_bounds, largest_first, queue.tasks(),
         numba.get_num_threads(), limits, levenberg_marquardt.state_at(variables))
