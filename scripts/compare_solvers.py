@@ -38,9 +38,10 @@ def problem_of(pair: ScanPair, config: settings.Config) -> tuple:
     """What the pipeline hands to its solver: the problem, the solver's settings, the least matches."""
     seen = []
 
-    def remember(*given):
-        seen.append(given)
-        return solve.solve(*given)
+    def remember(problem, wanted, min_matches):
+        if wanted is config.solver:     # refinement has settings of its own
+            seen.append((problem, wanted, min_matches))
+        return solve.solve(problem, wanted, min_matches)
 
     pipeline.solve, kept = remember, pipeline.solve
     try:
