@@ -178,6 +178,50 @@ def test_scans_agree_with_gtsam(folder, monkeypatch):
     assert_agreement(problem, solver, min_matches)
 
 
+# --- several minima ---
+
+@both_frames
+def test_a_second_try_leaves_a_high_minimum(config, monkeypatch):
+    """Bodies that hardly move, most matches of which are wrong: without truncation these lead them astray."""
+    bodies = [worlds.body((8.0, 2.0, 0.5), pose.from_translation([0.1, 0.0, 0.0]), rng(seed), 0.7, 0.02, 6, 4)
+              for seed in range(12)]
+    problem = worlds.joined(bodies).problem
+    second, solved, stats = fast.solve(problem, config, MIN_MATCHES)
+    monkeypatch.setattr(fast, "_SMALL", 0)
+    first, solved_first, stats_first = fast.solve(problem, config, MIN_MATCHES)
+    assert_allclose(stats.robust_final_error, energy(problem, second, config), rtol=1e-9)
+    assert stats.robust_final_error < 0.97 * stats_first.robust_final_error
+    assert (solved >= solved_first).all()
+    for c in range(len(bodies)):
+        rows = np.flatnonzero(problem.component == c)
+        found, before = (energy(problem.part(rows), motions[rows], config) for motions in (second, first))
+        same = (second[rows] == first[rows]).all()
+        assert same or found < 0.99 * before
+
+
+@pytest.mark.parametrize("min_matches", [3, 6, 9, 12])
+def test_a_second_try_loses_no_component(min_matches, monkeypatch):
+    """What is lowest with too few matches is not taken: it would not count as solved."""
+    bodies = [worlds.body((8.0, 2.0, 0.5), pose.from_translation([0.1, 0.0, 0.0]), rng(seed), 0.6, 0.1, 6, 4)
+              for seed in range(30)]
+    problem = worlds.joined(bodies).problem
+    _, solved, _ = fast.solve(problem, POINT, min_matches)
+    monkeypatch.setattr(fast, "_SMALL", 0)
+    assert (solved >= fast.solve(problem, POINT, min_matches)[1]).all()
+
+
+def test_near_matches_are_counted():
+    world = worlds.moved_room(0.4, 2.0, rng(4), wrong_matches=0.2, noise_m=0.02)
+    problem = replace(world.problem, initial=world.motions, match_index=world.problem.match_index[::2],
+                      match_target=world.problem.match_target[::2])
+    _, _, factors, variables = linearised(problem, POINT, True)
+    off_m = pose.apply(problem.initial[problem.match_index], problem.points[problem.match_index])
+    near = ((off_m - problem.match_target) ** 2).sum(axis=1) <= POINT.truncation_m**2
+    assert 0 < near.sum() < len(near)
+    counts = pose_graph.near_matches(factors, variables, (0, len(variables)))
+    assert counts == (near.sum(), len(near))
+
+
 # --- the same bytes ---
 
 ANSWER = """

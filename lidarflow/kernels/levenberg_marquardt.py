@@ -10,26 +10,28 @@ from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.hierarchy import weigh
 
 # Where an iteration gains less than relative_tolerance of the energy, or absolute_tolerance, it is the last,
-# unless the kernel let go or took back a match or a tie: then the next one may gain more. The others are
-# those of multigrid.solve, with what is negligible as a share of the gain below which an iteration is the
-# last.
+# unless the kernel let go or took back a match or a tie: then the next one may gain more. Components of fewer
+# than `small` variables may be tried twice, see `_try_again`. The others are those of multigrid.solve, with
+# what is negligible as a share of the gain below which an iteration is the last.
 Limits = namedtuple("Limits", (
     "max_iterations", "relative_tolerance", "absolute_tolerance", "step_tolerance", "negligible",
-    "max_products"))
+    "max_products", "small", "min_matches"))
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-5, 1e5, 10.0    # as in gtsam
 _SURELY_LESS = 0.03    # a cycle foresees at least this share of what there is to gain
+_CLEARLY_LOWER = 0.99  # below this share of an energy, another minimum is worth leaving gtsam's answer for
 FIGURES = 5            # iterations, first energy, last energy, whether the limit was reached, products
 
-# variables (M, 7) and those on trial; gradients (2, M, 6) of the smoothness and of all of the energy, and
-# active (2, M) matches and ties: one for the variables, one for those on trial, in turns.
-State = namedtuple("State", ("variables", "trials", "smoothness", "gradients", "active"))
+# variables (M, 7), those on trial, and start values or what another try ended with; gradients (2, M, 6) of
+# the smoothness and of all of the energy, and active (2, M) matches and ties: one for the variables, one for
+# those on trial, in turns.
+State = namedtuple("State", ("variables", "trials", "others", "smoothness", "gradients", "active"))
 
 
 def state_at(variables: np.ndarray) -> State:
     """Room to optimise variables (M, 7) in."""
     count = len(variables)
-    return State(variables, np.empty_like(variables), np.empty((2, count, 6)), np.empty((2, count, 6)),
-                 np.empty((2, count), np.uint8))
+    return State(variables, np.empty_like(variables), variables.copy(), np.empty((2, count, 6)),
+                 np.empty((2, count, 6)), np.empty((2, count), np.uint8))
 
 
 @njit(parallel=True)
@@ -55,11 +57,38 @@ def optimise_each(factors, hierarchy, room, edge_bounds, order, waiting, threads
 def _optimise(factors, hierarchy, room, c, edges, limits, state, block, figures):
     """Both steps for component c; the second starts with the smoothness that the first ended with."""
     nodes = (hierarchy.bounds[0, c], hierarchy.bounds[0, c + 1])
+    near, count = pose_graph.near_matches(factors, state.variables, nodes)
     smooth = pose_graph.smoothness(factors, state.variables, nodes, edges, block, state.smoothness[0])
     here = 0
     for robust in range(2):
         smooth, here = _step(factors, hierarchy, room, c, nodes, edges, limits, state, block,
                              robust == 1, smooth, here, figures[robust])
+    if nodes[1] - nodes[0] < limits.small and limits.min_matches <= near < count:
+        _try_again(factors, hierarchy, room, c, nodes, edges, limits, state, block, figures[1])
+
+
+@njit(error_model="numpy")
+def _try_again(factors, hierarchy, room, c, nodes, edges, limits, state, block, figures):
+    """The second step for component c from the start value, kept if it ends clearly lower.
+
+    Without truncation a few wrong matches lead a small component to another minimum, often a higher one. What
+    would keep too few matches to count as solved is no better, however low.
+    """
+    first, last = nodes
+    variables, others = state.variables, state.others
+    for i in range(first, last):
+        for k in range(variables.shape[1]):
+            variables[i, k], others[i, k] = others[i, k], variables[i, k]
+    again = np.zeros(FIGURES)
+    smooth = pose_graph.smoothness(factors, variables, nodes, edges, block, state.smoothness[0])
+    _step(factors, hierarchy, room, c, nodes, edges, limits, state, block, True, smooth, 0, again)
+    figures[0] += again[0]
+    figures[4] += again[4]
+    near, _ = pose_graph.near_matches(factors, variables, nodes)
+    if again[2] < _CLEARLY_LOWER * figures[2] and near >= limits.min_matches:
+        figures[2:4] = again[2:4]
+    else:
+        variables[first:last] = others[first:last]
 
 
 @njit(error_model="numpy")

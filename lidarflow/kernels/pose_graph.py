@@ -130,6 +130,20 @@ def _matches(factors, variables, nodes, robust, wrenches, active):
 
 
 @njit(error_model="numpy")
+def near_matches(factors, variables, nodes):
+    """How many matches of the variables from nodes[0] to nodes[1] are within the truncation, and how many
+    there are."""
+    matched, targets = factors.matched, factors.targets
+    near = count = 0
+    for i in range(nodes[0], nodes[1]):
+        x, y = variables[i, 4] - targets[i, 0], variables[i, 5] - targets[i, 1]
+        z = variables[i, 6] - targets[i, 2]
+        count += matched[i]
+        near += matched[i] and x * x + y * y + z * z <= factors.truncation_sq
+    return near, count
+
+
+@njit(error_model="numpy")
 def _ties(factors, variables, nodes, robust, block, wrenches, active):
     tied, ties, weight, most = factors.tied, factors.ties, factors.tie_weight, factors.tie_truncation_sq
     total = 0.0

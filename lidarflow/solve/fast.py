@@ -1,10 +1,11 @@
 """The pointwise factor graph solved by Levenberg-Marquardt, its normal equations by multigrid.
 
-Energy, steps and stopping rule are those of gtsam_lm.py. A variable is moved by a twist in the target's
-frame, so that the error between neighbours, Log(τ_i⁻¹ τ_j), changes by K (ξ_j − ξ_i), and a motion that all
-neighbours share costs nothing. K is the inverse left Jacobian of the error, which is near the identity,
-times the adjoint of τ_i⁻¹. The normal equations leave the first out; energy and gradient are exact, so the
-minimum is. What K leaves of the normal equations adds up like inertia (kernels/inertia.py).
+Energy, steps and stopping rule are those of gtsam_lm.py; small components, which have several minima, are
+tried without the first step as well. A variable is moved by a twist in the target's frame, so that the error
+between neighbours, Log(τ_i⁻¹ τ_j), changes by K (ξ_j − ξ_i), and a motion that all neighbours share costs
+nothing. K is the inverse left Jacobian of the error, which is near the identity, times the adjoint of τ_i⁻¹.
+The normal equations leave the first out; energy and gradient are exact, so the minimum is. What K leaves of
+the normal equations adds up like inertia (kernels/inertia.py).
 """
 
 import numba
@@ -18,6 +19,7 @@ from lidarflow.types import FlowProblem, SolveStats
 _STEP_TOLERANCE = 0.03    # conjugate gradients stop where less than this is left to add to their gain
 _NEGLIGIBLE = 0.03        # or less than this share of the gain below which an iteration is the last
 _MAX_PRODUCTS = 50
+_SMALL = 200              # components of fewer variables often have several minima, and are tried twice
 
 
 def solve(
@@ -32,14 +34,14 @@ def solve(
     found = problem.initial.copy()
     figures = np.zeros((0, 2, levenberg_marquardt.FIGURES))
     if tried.any():
-        figures = _optimise(problem, tried, config, found)
+        figures = _optimise(problem, tried, config, max(min_matches, 1), found)
     steps = [[common.Step(int(f[0]), f[1], f[2], common.AT_LIMIT if f[3] else common.CONVERGED) for f in rows]
              for rows in (figures[:, 0].tolist(), figures[:, 1].tolist())]
     return common.concluded("fast", problem, found, tried, *steps, config, min_matches)
 
 
 def _optimise(
-    problem: FlowProblem, tried: np.ndarray, config: SolverConfig, motions: np.ndarray
+    problem: FlowProblem, tried: np.ndarray, config: SolverConfig, min_matches: int, motions: np.ndarray
 ) -> np.ndarray:
     """Write the motions of the components `tried` (C,); returns figures (C', 2, FIGURES) of their steps."""
     label = np.where(tried, np.cumsum(tried) - 1, -1)[problem.component]
@@ -63,7 +65,7 @@ def _optimise(
     largest_first = np.argsort(-counts, kind="stable")
     limits = levenberg_marquardt.Limits(
         config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE, _STEP_TOLERANCE,
-        _NEGLIGIBLE, _MAX_PRODUCTS)
+        _NEGLIGIBLE, _MAX_PRODUCTS, _SMALL, min_matches)
     figures = levenberg_marquardt.optimise_each(
         factors, levels, multigrid.room_for(levels), edge_bounds, largest_first, queue.tasks(),
         numba.get_num_threads(), limits, levenberg_marquardt.state_at(variables))
