@@ -9,7 +9,7 @@ import time
 import numba
 import pytest
 
-from lidarflow.aside import Aside, ahead, done, there
+from lidarflow.aside import Aside, ahead, done, one_by_one, there
 
 needs_two_threads = pytest.mark.skipif(
     numba.config.NUMBA_NUM_THREADS < 2, reason="kernels have one thread here: nothing is done beside it")
@@ -48,6 +48,54 @@ def test_with_one_thread_everything_is_done_at_once():
             assert begun.done() and begun.result() is threading.current_thread()
     finally:
         numba.set_num_threads(before)
+
+
+@needs_two_threads
+def test_items_are_shared_between_threads_and_answers_come_in_order():
+    both = threading.Barrier(2, timeout=5.0)
+    done_by: dict[int, int] = {}
+
+    def work(number: int) -> int:
+        if number in (0, 1):
+            both.wait()      # neither goes on before the other thread has taken one as well
+        done_by[number] = threading.get_ident()
+        return number * number
+
+    with Aside() as beside:
+        assert beside.each(work, range(20)) == [number * number for number in range(20)]
+        assert beside.each(work, []) == []
+    assert len(set(done_by.values())) == 2 and threading.get_ident() in done_by.values()
+
+
+@needs_two_threads
+def test_a_thread_that_is_busy_is_not_waited_for():
+    go_on = threading.Event()
+    with Aside() as beside:
+        busy = beside.begin(go_on.wait, 5.0)
+        try:
+            assert beside.each(abs, [-1, 2, -3]) == [1, 2, 3] == one_by_one(abs, [-1, 2, -3])
+            assert not busy.done()
+        finally:
+            go_on.set()
+        assert busy.result()
+        assert beside.begin(int, "7").result() == 7
+
+
+def test_what_fails_for_an_item_is_raised_and_nothing_is_left_under_way():
+    seen = []
+
+    def work(number: int) -> None:
+        seen.append(number)
+        if number == 3:
+            raise ValueError("not this one")
+
+    with Aside() as beside:
+        for _ in range(20):
+            with pytest.raises(ValueError, match="not this one"):
+                beside.each(work, range(8))
+            count = len(seen)
+            time.sleep(0.001)
+            assert len(seen) == count
 
 
 def test_what_is_done_or_there_needs_no_waiting():

@@ -309,9 +309,20 @@ def test_a_body_is_completed_by_what_it_surrounds_and_what_follows_it():
     view = scene(np.array([0.6, 0.0, 0.0]), 14)
     rows = np.flatnonzero(view.points[:, 0] < 12.0)
     kept = rows[rng(15).random(len(rows)) < 0.7]
-    whole = body_of.completed(
-        view, Body(kept, pose.from_translation([0.6, 0.0, 0.0])), np.ones(len(view.points), bool))
-    assert len(whole.rows) > 0.98 * len(rows) and np.isin(whole.rows, rows).all()
+    nowhere, everywhere = np.zeros((2, len(view.points)), bool)
+    everywhere[:] = True
+    growth = body_of.Growth(Body(kept, pose.from_translation([0.6, 0.0, 0.0])), nowhere)
+    whole = body_of.completed(view, growth, everywhere)
+    assert len(whole.body.rows) > 0.98 * len(rows) and np.isin(whole.body.rows, rows).all()
+    assert whole.asked[whole.body.rows].all() and not nowhere.any()
+    # Of what it depends on, nothing else is looked at: what lies apart may be taken.
+    again = body_of.completed(view, growth, whole.asked)
+    np.testing.assert_array_equal(again.body.rows, whole.body.rows)
+    taken = everywhere.copy()
+    taken[np.setdiff1d(rows, kept)] = False
+    np.testing.assert_array_equal(body_of.completed(view, growth, taken).body.rows, kept)
+    none = body_of.Growth(None, nowhere)
+    assert body_of.completed(view, none, everywhere) is none
 
 
 @needs_shared

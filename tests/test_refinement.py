@@ -1,6 +1,7 @@
 """Refinement: limbs follow the next scan's surface where no single rigid motion does; what stands stays."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from worlds import grid_edges
 from lidarflow import open3d_import, pose, synthetic
 from lidarflow.config import Config, RefineConfig, load
 from lidarflow.kernels import tree, triangles
-from lidarflow.lidar import mesh, refinement
+from lidarflow.lidar import frontend, limbs, mesh, refinement
 from lidarflow.pipeline import estimate_flow
+from lidarflow.solve import solve
 from lidarflow.synthetic.human_motion import LIMBS
 from lidarflow.types import FlowProblem, ScanPair, Truth
 
@@ -39,22 +41,76 @@ def patches(*places_and_widths: tuple[float, float]) -> FlowProblem:
 
 def test_what_is_near_and_no_larger_than_a_person_is_refined():
     problem = patches((8.0, 1.0), (8.0, 3.0), (13.0, 1.0), (8.0, 2.4))
-    kept = refinement.wanted(problem, np.zeros(64, bool), RefineConfig())
+    kept = refinement.wanted(problem, RefineConfig())
     np.testing.assert_array_equal(kept, np.repeat([True, False, False, True], 16))
 
 
-def test_a_fragment_of_a_rigid_object_is_not_refined():
-    is_rigid = np.zeros(32, bool)
-    is_rigid[20] = True
-    kept = refinement.wanted(patches((8.0, 1.0), (9.0, 1.0)), is_rigid, RefineConfig())
-    np.testing.assert_array_equal(kept, np.repeat([True, False], 16))
-
-
 def test_no_rounds_refine_nothing_and_an_empty_graph_has_nothing_to_refine():
-    assert not refinement.wanted(patches((8.0, 1.0)), np.zeros(16, bool), RefineConfig(rounds=0)).any()
+    assert not refinement.wanted(patches((8.0, 1.0)), RefineConfig(rounds=0)).any()
     empty = FlowProblem(np.empty((0, 3)), np.empty((0, 4, 4)), np.empty(0, np.int32), np.empty((0, 3)),
                         np.empty((0, 2), np.int32), np.empty(0, np.int32))
-    assert len(refinement.wanted(empty, np.zeros(0, bool), RefineConfig())) == 0
+    assert len(refinement.wanted(empty, RefineConfig())) == 0
+
+
+def scene_of(problem: FlowProblem, target: np.ndarray) -> limbs.Scene:
+    """A source whose points are all variables, and a target (N, 3) without ground or triangles."""
+    count, config = len(problem.points), Config()
+    no_triangles = mesh.Mesh(
+        np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(len(target)), "grid")
+    graph = frontend.Graph(problem, np.arange(count, dtype=np.int32), np.arange(count))
+    return limbs.Scene(
+        graph, refinement.wanted(problem, config.refine), target, np.arange(len(target)), tree.build(target),
+        no_triangles, partial(solve, min_matches=config.graph.min_matches), config)
+
+
+def motions_of(parts: list[limbs.Part], count: int) -> np.ndarray:
+    """Motions (count, 4, 4) of the points of all parts, none of which share any; NaN where none has one."""
+    motions = np.full((count, 4, 4), np.nan)
+    for part in parts:
+        rows = np.flatnonzero(part.graph.variable >= 0)
+        assert np.isnan(motions[rows]).all()
+        motions[rows] = part.motions[part.graph.variable[rows]]
+    return motions
+
+
+def test_what_objects_touch_is_refined_with_them_and_the_rest_as_part_of_the_world():
+    """A post, a person, and a car's fragment: the first two wave something, the last is rigid."""
+    problem = patches((8.0, 1.0), (9.0, 1.0), (7.0, 1.0))
+    by_object = np.stack([pose.from_translation([0.0, 0.4, 0.0]), pose.from_translation([0.0, 1.5, 0.0])])
+    owner = np.repeat([-1, 0, 1], 16)
+    owner[16:24] = -1      # a component is touched where some of it is on an object
+    target = problem.points.copy()
+    target[owner == 0] += [0.0, 0.4, 0.0]
+    upper = problem.points[:, 2] > 0.9
+    target[upper, 0] += 0.1
+    scene, ego_motion = scene_of(problem, target), np.eye(4)
+    touched = frontend.touched(scene.graph, owner)
+    np.testing.assert_array_equal(touched, np.repeat([False, True, True], 16))
+    solved = limbs.Part(replace(scene.graph, variable=np.full(48, -1, np.int32)), np.empty((0, 4, 4)))
+
+    def with_objects(touched: np.ndarray) -> limbs.Part:
+        return limbs.of_objects(
+            scene, touched, solved, owner, by_object, np.array([False, True]), ego_motion)
+
+    world = limbs.of_world(scene, ego_motion)
+    assert (world.graph.variable >= 0).all()
+    motions = motions_of([limbs.apart_from(world, scene.graph, touched), with_objects(touched)], 48)
+    np.testing.assert_array_equal(np.isnan(motions[:, 0, 0]), np.repeat([False, False, True], 16))
+    np.testing.assert_array_equal(motions, motions_of([with_objects(np.ones(48, bool))], 48))
+    moved = pose.apply(motions[:32], problem.points[:32]) - problem.points[:32]
+    lower = problem.points[:16, 2] < 0.5
+    assert (moved[:16][upper[:16], 0] > 0.06).all() and (np.abs(moved[:16][lower, 0]) < 0.02).all()
+    assert np.median(moved[24:32, 1]) > 0.3
+
+
+def test_limbs_begin_at_what_was_solved():
+    problem = patches((8.0, 1.0))
+    scene = replace(scene_of(problem, problem.points), config=load(overrides=("refine.rounds=0",)))
+    start = np.broadcast_to(pose.from_translation([0.0, 0.0, 0.2]), (16, 4, 4))
+    found = limbs.of_objects(
+        scene, np.ones(16, bool), limbs.Part(scene.graph, start), np.full(16, -1), np.empty((0, 4, 4)),
+        np.empty(0, bool), np.eye(4))
+    np.testing.assert_array_equal(found.motions, start)
 
 
 # ---- where the surface is ---------------------------------------------------------------------------------
