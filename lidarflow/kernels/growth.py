@@ -145,6 +145,10 @@ def _agreeing(near, free, motion, own, target, target_normals, ground, limits, n
         ego_m, ego_plane_m = own.by_ego_m[row], own.by_ego_plane_m[row]
         x, y, z = moved(own.points[row], motion)
         place, apart_sq = icp.follow(target, x, y, z, 2.0 * limits.cap_m, row, nearest)
+        if math.sqrt(apart_sq) < ego_m - better_m:     # whatever ground or planes say
+            rows[count] = row
+            count += 1
+            continue
         own_m, plane_m = misfit.beyond_nearest(
             x, y, z, place, apart_sq, own.normals[row], motion, target, target_normals, ground, limits.cap_m,
             limits.min_agreement)

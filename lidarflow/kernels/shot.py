@@ -47,23 +47,30 @@ def describe(keypoints: np.ndarray, seen: Support, min_neighbours: int) -> tuple
 
     Rows of the keypoints (K, 3) without enough neighbours are NaN.
     """
-    descriptors = np.full((len(keypoints), SIZE), np.nan, np.float32)
+    descriptors = np.empty((len(keypoints), SIZE), np.float32)
+    return descriptors, describe_into(descriptors, np.arange(len(keypoints)), keypoints, seen, min_neighbours)
+
+
+def describe_into(
+    table: np.ndarray, rows: np.ndarray, keypoints: np.ndarray, seen: Support, min_neighbours: int
+) -> np.ndarray:
+    """As `describe`, with the descriptors at `rows` (K,) of a table (T, 352); returns the frames."""
     frames = np.full((len(keypoints), 3, 3), np.nan)
-    _describe(keypoints, *seen, min_neighbours, descriptors, frames)
-    return descriptors, frames
+    _describe(keypoints, *seen, min_neighbours, table, rows, frames)
+    return frames
 
 
 @njit(parallel=True)
-def _describe(keypoints, surface, normals, keys, lower, shape, radius_m, min_neighbours, descriptors, frames):
+def _describe(keypoints, surface, normals, keys, lower, shape, radius_m, min_neighbours, table, rows, frames):
     for chunk in numba.prange((len(keypoints) + _CHUNK - 1) // _CHUNK):
         start, end = chunk * _CHUNK, (chunk + 1) * _CHUNK
         _describe_some(keypoints[start:end], surface, normals, keys, lower, shape, radius_m, min_neighbours,
-                       descriptors[start:end], frames[start:end])
+                       table, rows[start:end], frames[start:end])
 
 
 @njit()
 def _describe_some(
-    keypoints, surface, normals, keys, lower, shape, radius_m, min_neighbours, descriptors, frames
+    keypoints, surface, normals, keys, lower, shape, radius_m, min_neighbours, table, rows, frames
 ):
     starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
     offsets, index, cosines = np.empty((4, 0)), np.empty(0, np.int64), np.empty(0)
@@ -76,12 +83,13 @@ def _describe_some(
             offsets, index, cosines = np.empty((4, room)), np.empty(room, np.int64), np.empty(room)
             bins, shares = np.empty((_SHARES, room), np.int64), np.empty((_SHARES, room))
         count = _gather(keypoints[i], surface, starts, ends, run_count, radius_m, offsets, index)
-        frame = frames[i]
+        frame, descriptor = frames[i], table[rows[i]]
+        descriptor[:] = np.nan
         if count < min_neighbours or not local_frame.fill(frame, offsets, count, radius_m):
             continue
         count = _incline(frame[2], normals, index, count, offsets, cosines)
         _share(frame, offsets, cosines, count, radius_m, bins, shares)
-        _count(bins, shares, count, descriptors[i])
+        _count(bins, shares, count, descriptor)
 
 
 @njit()

@@ -42,7 +42,7 @@ class Keypoints:
         chosen = np.arange(len(self.row)) if chosen is None else chosen
         new = chosen[~self._is_made[chosen]]
         if len(new):
-            self._descriptors[new], _ = shot.describe(self.points[new], self._seen, self._min_neighbours)
+            shot.describe_into(self._descriptors, new, self.points[new], self._seen, self._min_neighbours)
             self._is_made[new] = True
         kept = chosen[np.isfinite(self._descriptors[chosen, 0])]
         return Described(self.points[kept], kept, self._descriptors)

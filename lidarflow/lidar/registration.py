@@ -82,11 +82,14 @@ def robust_point_to_plane(
     Tukey's loss lets moving objects go. It is as wide as one reach after the other, the widest first. What is
     found within the last reach counts; before, some of the points, evenly over their order, lead there.
     """
-    some = source[::max(len(source) // _LEADING_POINTS, 1)]
+    leading = slice(None, None, max(len(source) // _LEADING_POINTS, 1))
+    some, of_all = source[leading], icp.nothing_known(len(source))
     motion, nearest = start, icp.nothing_known(len(some))
     for reach_m in reaches_m:
         motion = _settled(some, target, reach_m, motion, nearest, _NEARLY_SETTLED)
-    return _settled(source, target, reaches_m[-1], motion, icp.nothing_known(len(source)), _SETTLED)
+    for known, of_some in zip(of_all, nearest, strict=True):
+        known[leading] = of_some
+    return _settled(source, target, reaches_m[-1], motion, of_all, _SETTLED)
 
 
 def _settled(

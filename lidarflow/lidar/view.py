@@ -77,9 +77,12 @@ def look(source: Cloud, target: Cloud, config: ObjectsConfig) -> View:
     plane_m = np.where(on_plane, np.minimum(np.abs(at_rest.offset_m), capped_m), capped_m)
 
     near_m = tolerance(np.linalg.norm(upright.points, axis=1), config)
-    was_there = neighbours.any_within(source.upright.tree, upright.points, near_m)
-    gone = np.flatnonzero(~was_there)
-    was_there[gone] = neighbours.any_within(source.ground, upright.points[gone], near_m[gone])
+    was_there = np.zeros(len(near_m), bool)
+    met = np.flatnonzero(at_rest.row >= 0)
+    was_there[at_rest.row[met[at_rest.distance_m[met] <= near_m[at_rest.row[met]]]]] = True
+    for surroundings in (source.upright.tree, source.ground):
+        gone = np.flatnonzero(~was_there)
+        was_there[gone] = neighbours.any_within(surroundings, upright.points[gone], near_m[gone])
     newcomers = upright.points[~was_there]
     everything = np.concatenate([upright.points, target.ground.points])
     return View(
