@@ -11,20 +11,26 @@ NEAR = 27     # cells around one, itself among them
 
 
 class Cells(NamedTuple):
-    """Points gathered by cell.
+    """Points gathered by cell, and cells by column.
 
-    cell_m  float            size of a cell
-    place   (C, 3) int64     of each occupied cell: the floor of coordinates over cell_m
-    table   (S,) int32       cell in each slot of the hash table, -1 = empty
-    order   (N,) int64       rows of the points, cell by cell, ascending in each
-    bounds  (C + 1,) int64   where each cell begins in this order, and the end
+    cell_m   float            size of a cell
+    place    (C, 3) int64     of each occupied cell: the floor of coordinates over cell_m
+    order    (N,) int64       rows of the points, cell by cell, ascending in each
+    bounds   (C + 1,) int64   where each cell begins in this order, and the end
+    columns  (D, 3) int64     places of the columns that hold cells, with z = 0
+    table    (S,) int32       column in each slot of the hash table, -1 = empty
+    stacked  (C,) int64       cells, column by column, each from the lowest up
+    stacks   (D + 1,) int64   where each column begins among them, and the end
     """
 
     cell_m: float
     place: np.ndarray
-    table: np.ndarray
     order: np.ndarray
     bounds: np.ndarray
+    columns: np.ndarray
+    table: np.ndarray
+    stacked: np.ndarray
+    stacks: np.ndarray
 
 
 def build(points: np.ndarray, cell_m: float) -> Cells:
@@ -35,14 +41,36 @@ def build(points: np.ndarray, cell_m: float) -> Cells:
 @njit()
 def built(points, cell_m):
     """As `build`, for other kernels."""
-    place, table, number, counts = _hashed(points, cell_m)
+    place, _, number, counts = _hashed(points, cell_m)
+    order, bounds = _by_number(number, counts)
+    columns, table, column, heights = _hashed_places(place)
+    stacked, stacks = _by_number(column, heights)
+    for k in range(len(heights)):
+        _sort_by_height(stacked[stacks[k]: stacks[k + 1]], place)
+    return Cells(cell_m, place, order, bounds, columns, table, stacked, stacks)
+
+
+@njit()
+def _by_number(number, counts):
+    """Rows (N,) by their number, ascending in each, and where each of the numbers begins, and the end."""
     bounds = np.zeros(len(counts) + 1, np.int64)
     bounds[1:] = np.cumsum(counts)
-    order, filled = np.empty(len(points), np.int64), bounds[:-1].copy()
-    for i in range(len(points)):
+    order, filled = np.empty(len(number), np.int64), bounds[:-1].copy()
+    for i in range(len(number)):
         order[filled[number[i]]] = i
         filled[number[i]] += 1
-    return Cells(cell_m, place, table, order, bounds)
+    return order, bounds
+
+
+@njit()
+def _sort_by_height(cells, place):
+    """Sort the few cells of a column from the lowest up."""
+    for k in range(1, len(cells)):
+        cell, at = cells[k], k
+        while at > 0 and place[cells[at - 1], 2] > place[cell, 2]:
+            cells[at] = cells[at - 1]
+            at -= 1
+        cells[at] = cell
 
 
 @njit()
@@ -54,13 +82,22 @@ def numbered(points, cell_m):
 
 @njit()
 def around(cells, place, near):
-    """Fill `near` (NEAR,) with the occupied cells that touch the one at `place` (3,); returns how many."""
+    """Fill `near` (NEAR,) with the occupied cells that touch the one at `place` (3,); returns how many.
+
+    Nine columns are looked up: that most cells around one are empty makes looking for each of them slow.
+    """
     count = 0
     for x in range(place[0] - 1, place[0] + 2):
         for y in range(place[1] - 1, place[1] + 2):
-            for z in range(place[2] - 1, place[2] + 2):
-                cell = cells.table[_slot(x, y, z, cells.table, cells.place)]
-                if cell >= 0:
+            column = cells.table[_slot(x, y, 0, cells.table, cells.columns)]
+            if column < 0:
+                continue
+            for k in range(cells.stacks[column], cells.stacks[column + 1]):
+                cell = cells.stacked[k]
+                above = cells.place[cell, 2] - place[2]
+                if above > 1:
+                    break
+                if above >= -1:
                     near[count] = cell
                     count += 1
     return count
@@ -68,10 +105,8 @@ def around(cells, place, near):
 
 @njit()
 def _hashed(points, cell_m):
-    slots = 16
-    while slots < 2 * len(points):
-        slots *= 2
-    table, place = np.full(slots, -1, np.int32), np.empty((len(points), 3), np.int64)
+    """Places (C, 3) of the cells of points, a table of them, the cell (N,) of each, and their points (C,)."""
+    table, place = _room(len(points))
     number, counts = np.empty(len(points), np.int64), np.zeros(len(points), np.int64)
     found, cell = 0, -1
     for i in range(len(points)):
@@ -80,15 +115,43 @@ def _hashed(points, cell_m):
         z = math.floor(points[i, 2] / cell_m)
         # Points that follow one another are often in one cell.
         if cell < 0 or place[cell, 0] != x or place[cell, 1] != y or place[cell, 2] != z:
-            slot = _slot(x, y, z, table, place)
-            if table[slot] < 0:
-                table[slot] = found
-                place[found, 0], place[found, 1], place[found, 2] = x, y, z
-                found += 1
-            cell = table[slot]
+            cell = _entered(x, y, z, table, place, found)
+            found = max(found, cell + 1)
         number[i] = cell
         counts[cell] += 1
     return place[:found].copy(), table, number, counts[:found].copy()
+
+
+@njit()
+def _hashed_places(place):
+    """Columns (D, 3) of places (C, 3), a table of them, the column (C,) of each, and their places (D,)."""
+    table, columns = _room(len(place))
+    number, counts = np.empty(len(place), np.int64), np.zeros(len(place), np.int64)
+    found = 0
+    for i in range(len(place)):
+        number[i] = _entered(place[i, 0], place[i, 1], 0, table, columns, found)
+        found = max(found, number[i] + 1)
+        counts[number[i]] += 1
+    return columns[:found].copy(), table, number, counts[:found].copy()
+
+
+@njit()
+def _room(count):
+    """An empty hash table (S,) for as many cells, and room (count, 3) for their places."""
+    slots = 16
+    while slots < 2 * count:
+        slots *= 2
+    return np.full(slots, -1, np.int32), np.empty((count, 3), np.int64)
+
+
+@njit(inline="always")
+def _entered(x, y, z, table, place, found):
+    """Number of the cell at x, y, z; the next, `found`, if it is not in the table yet."""
+    slot = _slot(x, y, z, table, place)
+    if table[slot] < 0:
+        table[slot] = found
+        place[found, 0], place[found, 1], place[found, 2] = x, y, z
+    return table[slot]
 
 
 @njit(inline="always")

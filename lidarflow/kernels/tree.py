@@ -55,16 +55,17 @@ def grown(points):
     while count > _LEAF * (nodes + 1) // 2:
         nodes = 2 * nodes + 1
     placed, rows = points.copy(), np.arange(count)
-    starts, ends = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64)
-    boxes = _no_boxes(nodes)
+    starts, ends, boxes = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64), np.empty((nodes, 2, 3))
     ends[0] = count
     leaves = nodes // 2
-    for node in range(nodes):
+    # One half is done before the other, while its points are at hand.
+    waiting = np.empty(DEPTH, np.int64)
+    waiting[0], depth = 0, 1
+    while depth > 0:
+        depth -= 1
+        node = waiting[depth]
         start, end = starts[node], ends[node]
-        for i in range(start, end):
-            for k in range(3):
-                boxes[node, 0, k] = min(boxes[node, 0, k], placed[i, k])
-                boxes[node, 1, k] = max(boxes[node, 1, k], placed[i, k])
+        _fill_box(boxes[node], placed, start, end)
         if node >= leaves:
             continue
         middle = (start + end) // 2
@@ -75,7 +76,20 @@ def grown(points):
         _part(placed, rows, axis, start, end, middle)
         starts[2 * node + 1], ends[2 * node + 1] = start, middle
         starts[2 * node + 2], ends[2 * node + 2] = middle, end
+        waiting[depth], waiting[depth + 1] = 2 * node + 2, 2 * node + 1
+        depth += 2
     return Tree(placed, rows, starts, ends, boxes)
+
+
+@njit()
+def _fill_box(box, points, start, end):
+    """Make `box` (2, 3) that around the points from `start` to `end`."""
+    ax, ay, az = np.inf, np.inf, np.inf
+    bx, by, bz = -np.inf, -np.inf, -np.inf
+    for i in range(start, end):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        ax, ay, az, bx, by, bz = min(ax, x), min(ay, y), min(az, z), max(bx, x), max(by, y), max(bz, z)
+    box[0, 0], box[0, 1], box[0, 2], box[1, 0], box[1, 1], box[1, 2] = ax, ay, az, bx, by, bz
 
 
 @njit()
