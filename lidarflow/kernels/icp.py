@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from lidarflow.kernels import queue
 from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import solve_positive4
@@ -48,20 +49,30 @@ def forget(nearest, i):
     nearest.place[i], nearest.clear_m[i] = -1, -np.inf
 
 
-@njit(parallel=True)
 def onto_points(points, bounds, group, translations, target, gates_m, rounds_per_gate):
     """Motions (H, 4, 4) of groups of points onto the points of a tree, from `translations` (H, 3).
 
     Start h moves group[h], the points (N, 3) from bounds[group[h]] up to bounds[group[h] + 1].
     """
-    count = len(group)
-    motions = np.empty((count, 4, 4))
-    for k in numba.prange(count):
-        # Every other one: threads get halves, and groups often come with the largest first.
-        h = 2 * k if 2 * k < count else 2 * k - (count - (1 - count % 2))
-        own = points[bounds[group[h]]: bounds[group[h] + 1]]
-        _onto_points(own, target, translations[h], gates_m, rounds_per_gate, motions[h])
+    motions = np.empty((len(group), 4, 4))
+    largest_first = np.argsort(-np.diff(bounds)[group], kind="stable")
+    _onto_points_each(points, bounds, group, translations, target, gates_m, rounds_per_gate, largest_first,
+                      queue.tasks(), numba.get_num_threads(), motions)
     return motions
+
+
+@njit(parallel=True)
+def _onto_points_each(
+    points, bounds, group, translations, target, gates_m, rounds_per_gate, order, waiting, threads, motions
+):
+    """Each thread takes the next start when it is done with one: they differ in size."""
+    for _ in numba.prange(threads):
+        task = queue.take(waiting)
+        while task < len(order):
+            h = order[task]
+            own = points[bounds[group[h]]: bounds[group[h] + 1]]
+            _onto_points(own, target, translations[h], gates_m, rounds_per_gate, motions[h])
+            task = queue.take(waiting)
 
 
 @njit()

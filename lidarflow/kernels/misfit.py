@@ -5,6 +5,7 @@ import math
 import numba
 import numpy as np
 
+from lidarflow.kernels import queue
 from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import moved, turned
@@ -101,7 +102,6 @@ def beyond_nearest(
     return distance_m, distance_m
 
 
-@njit(parallel=True)
 def mean_sq_after(points, normals, rows, bounds, group, motions, target, target_normals, beside, cap_m,
                   min_agreement, distance_weight):
     """Mean (H,) of plane² + weight · distance² after each of motions (H, 4, 4), which moves group[h].
@@ -109,13 +109,24 @@ def mean_sq_after(points, normals, rows, bounds, group, motions, target, target_
     Groups are rows[bounds[g]: bounds[g + 1]] of points (N, 3) with normals (N, 3).
     """
     mean_sq = np.empty(len(group))
-    for h in numba.prange(len(group)):
-        own = rows[bounds[group[h]]: bounds[group[h] + 1]]
-        distance_m, plane_m = np.empty(len(own)), np.empty(len(own))
-        after(points, normals, own, motions[h], target, target_normals, beside, cap_m, min_agreement,
-              distance_m, plane_m)
-        total = 0.0
-        for k in range(len(own)):
-            total += plane_m[k] * plane_m[k] + distance_weight * distance_m[k] * distance_m[k]
-        mean_sq[h] = total / len(own)
+    _mean_sq_each(points, normals, rows, bounds, group, motions, target, target_normals, beside, cap_m,
+                  min_agreement, distance_weight, queue.tasks(), numba.get_num_threads(), mean_sq)
     return mean_sq
+
+
+@njit(parallel=True)
+def _mean_sq_each(points, normals, rows, bounds, group, motions, target, target_normals, beside, cap_m,
+                  min_agreement, distance_weight, waiting, threads, mean_sq):
+    """Each thread takes the next motion when it is done with one."""
+    for _ in numba.prange(threads):
+        h = queue.take(waiting)
+        while h < len(group):
+            own = rows[bounds[group[h]]: bounds[group[h] + 1]]
+            distance_m, plane_m = np.empty(len(own)), np.empty(len(own))
+            after(points, normals, own, motions[h], target, target_normals, beside, cap_m, min_agreement,
+                  distance_m, plane_m)
+            total = 0.0
+            for k in range(len(own)):
+                total += plane_m[k] * plane_m[k] + distance_weight * distance_m[k] * distance_m[k]
+            mean_sq[h] = total / len(own)
+            h = queue.take(waiting)
