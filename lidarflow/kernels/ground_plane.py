@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from lidarflow.kernels import stack
 from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
 
@@ -45,7 +46,7 @@ def heights(ground, x, y, radius_m):
     """z (K,) of the ground's points no farther from x, y than `radius_m`, heights not counted."""
     found, count = np.empty(len(ground.rows)), 0
     leaves, radius_sq = len(ground.ends) // 2, radius_m * radius_m
-    waiting = np.empty(trees.DEPTH, np.int64)
+    waiting = stack.integers()
     waiting[0], depth = 0, 1
     while depth > 0:
         depth -= 1

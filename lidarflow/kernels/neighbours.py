@@ -5,10 +5,10 @@ import math
 import numba
 import numpy as np
 
+from lidarflow.kernels import stack
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.tree import (
     CHUNK,
-    DEPTH,
     Tree,
     box_distance_sq,
     distance_sq,
@@ -107,7 +107,7 @@ def rows_near(tree, body, radius_m):
     """As `near_rows`, in the order of the tree, for other kernels."""
     found, count = np.empty(len(tree.rows), np.int64), 0
     leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
-    waiting = np.empty(DEPTH, np.int64)
+    waiting = stack.integers()
     waiting[0], depth = 0, 1
     witness = 0   # what was near to the last point is probably near to this one
     while depth > 0:
@@ -178,7 +178,7 @@ def _counts_in_chunks(tree, before, points, radius_m, counts):
 def _counts_around(tree, before, points, radius_m, counts):
     """Add the counts of marks (K, F) to `counts`; a node in reach as a whole is two look-ups in `before`."""
     leaves, radius_sq = len(tree.ends) // 2, radius_m * radius_m
-    waiting = np.empty(DEPTH, np.int64)
+    waiting = stack.integers()
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         waiting[0], depth = 0, 1

@@ -1,17 +1,18 @@
 """k-d tree over points, for queries inside other kernels.
 
 Nodes are halves of halves down to small leaves, each with the box around its points; the children of node i
-are 2 i + 1 and 2 i + 2. Points lie in the order of the leaves, so that a node is one run of them.
+are 2 i + 1 and 2 i + 2. Points lie in the order of the leaves, so that a node is one run of them. While one
+node is searched no more of them wait than the tree has levels, which is always less than stack.SIZE.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
+from lidarflow.kernels import stack
 from lidarflow.kernels.compiled import njit
 
 _LEAF = 12       # points of a leaf, about
-DEPTH = 64      # nodes that wait while one is searched, at most
 CHUNK = 512      # queries that one thread takes at a time; it takes longer to start than fewer
 
 
@@ -59,7 +60,7 @@ def grown(points):
     ends[0] = count
     leaves = nodes // 2
     # One half is done before the other, while its points are at hand.
-    waiting = np.empty(DEPTH, np.int64)
+    waiting = stack.integers()
     waiting[0], depth = 0, 1
     while depth > 0:
         depth -= 1
@@ -196,7 +197,7 @@ def nearest(tree, x, y, z, best_sq, best):
 
     `best` and `best_sq` where nothing is nearer than the root of `best_sq`.
     """
-    waiting, waiting_sq = np.empty(DEPTH, np.int64), np.empty(DEPTH)
+    waiting, waiting_sq = stack.integers(), stack.reals()
     waiting[0], waiting_sq[0], depth = 0, box_distance_sq(tree.boxes, 0, x, y, z), 1
     while depth > 0:
         node, node_sq, depth = descend(tree, x, y, z, best_sq, waiting, waiting_sq, depth)
@@ -216,7 +217,7 @@ def nearest_two(tree, x, y, z, reach_sq):
     Distances are `reach_sq` where nothing is nearer.
     """
     best, best_sq, second_sq = -1, reach_sq, reach_sq
-    waiting, waiting_sq = np.empty(DEPTH, np.int64), np.empty(DEPTH)
+    waiting, waiting_sq = stack.integers(), stack.reals()
     waiting[0], waiting_sq[0], depth = 0, box_distance_sq(tree.boxes, 0, x, y, z), 1
     while depth > 0:
         node, node_sq, depth = descend(tree, x, y, z, second_sq, waiting, waiting_sq, depth)
@@ -235,7 +236,7 @@ def nearest_two(tree, x, y, z, reach_sq):
 def within(tree, x, y, z, radius_sq):
     """Place in the tree of some point whose squared distance from x, y, z is at most `radius_sq`, or -1."""
     leaves = len(tree.ends) // 2
-    waiting = np.empty(DEPTH, np.int64)
+    waiting = stack.integers()
     waiting[0], depth = 0, 1
     while depth > 0:
         depth -= 1
@@ -262,7 +263,7 @@ def within(tree, x, y, z, radius_sq):
 def all_within(tree, x, y, z, radius_sq, found):
     """Fill `found` with the places at most the root of `radius_sq` from x, y, z; returns how many."""
     leaves, count = len(tree.ends) // 2, 0
-    waiting = np.empty(DEPTH, np.int64)
+    waiting = stack.integers()
     waiting[0], depth = 0, 1
     while depth > 0:
         depth -= 1

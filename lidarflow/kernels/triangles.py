@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from lidarflow.kernels import stack
 from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.tree import Tree
@@ -92,7 +93,7 @@ def _nearest_triangle(corners, boxes, tree, x, y, z, best_sq, guess):
         guess_sq = _apart_sq(corners, guess, x, y, z)
         if guess_sq < best_sq:
             best_sq, best = guess_sq, guess
-    waiting, waiting_sq = np.empty(trees.DEPTH, np.int64), np.empty(trees.DEPTH)
+    waiting, waiting_sq = stack.integers(), stack.reals()
     waiting[0], waiting_sq[0], depth = 0, trees.box_distance_sq(tree.boxes, 0, x, y, z), 1
     while depth > 0:
         node, node_sq, depth = trees.descend(tree, x, y, z, best_sq, waiting, waiting_sq, depth)
