@@ -186,7 +186,7 @@ def prepare(
     """
     timed, points = Stopwatch(), pair.source.points
     guess = beside.begin(ego_guess) if ego_guess else None
-    for scan in (pair.source, pair.target):
+    for scan in (pair.target,) if previous else (pair.source, pair.target):
         preparation.require_points(scan, config.preparation)
     with timed("features"):
         target = features.extract(pair.target, config, beside)
