@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.kernels import cells, deviation, lanes
+from lidarflow.kernels import cells, deviation, grid, lanes, normals, queue, stack, thinning
+from lidarflow.kernels.compiled import njit
 
 
 def rng(seed: int) -> np.random.Generator:
@@ -76,8 +77,75 @@ def check_deviation(count: int) -> None:
         np.testing.assert_allclose(deviation_m**2, (moves**2).sum() + own_sq, rtol=1e-9)
 
 
+def check_information(count: int) -> None:
+    random = rng(5)
+    at, across, centre = random.normal(0, 9, (count, 3)), random.normal(size=(count, 3)), np.arange(3.0)
+    weights = random.uniform(1.0, 9.0, count)
+    rows = np.hstack([np.cross(at - centre, across), across])
+    expected = (rows * weights[:, None]).T @ rows
+    np.testing.assert_allclose(deviation.information(at, across, centre, weights), expected, rtol=1e-9)
+
+
+def check_thinned(count: int) -> None:
+    points = rng(6).uniform(-9.0, 9.0, (count, 3))
+    points[::7] *= 5.0
+    points[3] = np.nan
+    points[4] = [0.1, -0.2, 0.0]
+    range_m = np.linalg.norm(points, axis=1)
+    kept = points[(range_m >= 1.5) & (range_m <= 30.0)]
+    for wanted_m, share in ((0.5, 1.0), (0.5, 0.04)):
+        means, grown, found, voxel_m, in_range = thinning.thinned(points, 1.5, 30.0, wanted_m, share, 3.5)
+        assert in_range == len(kept)
+        np.testing.assert_allclose(voxel_m, min(wanted_m, share * np.sqrt(np.median((kept**2).sum(axis=1)))))
+        np.testing.assert_array_equal(means, grid.means(kept, voxel_m))
+        np.testing.assert_array_equal(grown.points, means[grown.rows])
+        np.testing.assert_array_equal(np.sort(grown.rows), np.arange(len(means)))
+        np.testing.assert_array_equal(found, normals.estimate(grown.points, grown.points, 3.5 * voxel_m))
+
+
+def check_nothing_thinned() -> None:
+    for points in (np.empty((0, 3)), np.full((4, 3), np.nan), np.zeros((4, 3))):
+        means, grown, found, _, in_range = thinning.thinned(points, 0.0, 80.0, 0.2, 0.04, 3.5)
+        assert len(means) == len(grown.points) == len(found) == in_range
+        assert np.isnan(found).all()
+
+
+def tasks_taken() -> None:
+    waiting = queue.tasks()
+    assert [queue.take(waiting) for _ in range(3)] == [0, 1, 2]
+
+
+@njit()
+def tripled(count):
+    """Sums over arrays on the stack: of a caller, and of a function it calls while its own are in use."""
+    own, total = stack.integers(), 0.0
+    for k in range(count):
+        own[k] = k
+        total += doubled(k)
+    for k in range(count):
+        total += own[k]
+    return total
+
+
+@njit()
+def doubled(k):
+    reals, integers = stack.reals(), stack.integers()
+    for i in range(stack.SIZE):
+        reals[i], integers[i] = 2.0 * k, -7
+    return reals[stack.SIZE - 1]
+
+
+def check_stack() -> None:
+    assert tripled(stack.SIZE) == 3.0 * sum(range(stack.SIZE))
+
+
 def check_all_tiny() -> None:
     """Every comparison on tiny inputs, for interpreted kernels."""
+    check_information(5)
+    check_thinned(30)
+    check_nothing_thinned()
+    check_stack()
+    tasks_taken()
     check_cells(40)
     check_no_cells()
     check_lanes(20)
@@ -98,6 +166,17 @@ def test_lanes():
 
 def test_deviation():
     check_deviation(200)
+    check_information(100)
+
+
+def test_a_scan_is_thinned_for_registration():
+    check_thinned(3000)
+    check_nothing_thinned()
+
+
+def test_arrays_on_the_stack_are_each_functions_own():
+    check_stack()
+    tasks_taken()
 
 
 def test_blocks_are_plain_python_underneath():

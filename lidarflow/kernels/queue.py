@@ -3,7 +3,7 @@
 import numpy as np
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 
 
 def tasks() -> np.ndarray:
@@ -11,9 +11,16 @@ def tasks() -> np.ndarray:
     return np.zeros(1, np.int64)
 
 
+def take(queue: np.ndarray) -> int:
+    """Number of the next task, from 0 on; in compiled code no two threads get the same."""
+    task = queue[0]
+    queue[0] += 1
+    return task
+
+
 @intrinsic
-def take(typing_context, queue):
-    """Number of the next task, from 0 on, in compiled code only; no two threads get the same."""
+def _take(typing_context, queue):
+    """As `take`: counting on and looking at the number is one step."""
 
     def generate(context, builder, signature, arguments):
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -22,3 +29,8 @@ def take(typing_context, queue):
         return builder.atomic_rmw("add", place, context.get_constant(types.int64, 1), "monotonic")
 
     return types.int64(queue), generate
+
+
+@overload(take, inline="always")
+def _compiled_take(queue):
+    return lambda queue: _take(queue)

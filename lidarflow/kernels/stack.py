@@ -3,7 +3,10 @@
 They are gone when the function that asks for them returns, and must not be returned by it.
 """
 
-from numba import types
+from functools import partial
+
+import numpy as np
+from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
@@ -11,7 +14,7 @@ SIZE = 64
 
 
 def _array_of(number: types.Type):
-    """What makes an array (SIZE,) of such numbers, whose values are not set; in compiled code only."""
+    """What makes an array (SIZE,) of such numbers in compiled code; its values are not set."""
 
     @intrinsic
     def array(typing_context):
@@ -32,4 +35,8 @@ def _array_of(number: types.Type):
     return array
 
 
-integers, reals = _array_of(types.int64), _array_of(types.float64)
+# No function may stand between these and who calls them: the array would be gone when that one returns.
+if config.DISABLE_JIT:
+    integers, reals = partial(np.empty, SIZE, np.int64), partial(np.empty, SIZE)
+else:
+    integers, reals = _array_of(types.int64), _array_of(types.float64)
