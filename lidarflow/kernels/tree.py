@@ -13,6 +13,8 @@ from lidarflow.kernels import stack
 from lidarflow.kernels.compiled import njit
 
 _LEAF = 12       # points of a leaf, about
+_FEW = 12        # so few are put in order one by one
+_ROW, _HALF = np.uint64(0xFFFFFFFF), np.uint64(32)
 CHUNK = 512      # queries that one thread takes at a time; it takes longer to start than fewer
 
 
@@ -55,10 +57,12 @@ def grown(points):
     count, nodes = len(points), 1
     while count > _LEAF * (nodes + 1) // 2:
         nodes = 2 * nodes + 1
-    placed, rows = points.copy(), np.arange(count)
     starts, ends, boxes = np.zeros(nodes, np.int64), np.zeros(nodes, np.int64), np.empty((nodes, 2, 3))
     ends[0] = count
-    leaves = nodes // 2
+    # Rows stand in the low half of what is put in order; coordinates that decide stand before them.
+    ordered = np.empty(count, np.uint64)
+    for i in range(count):
+        ordered[i] = np.uint64(i)
     # One half is done before the other, while its points are at hand.
     waiting = stack.integers()
     waiting[0], depth = 0, 1
@@ -66,31 +70,79 @@ def grown(points):
         depth -= 1
         node = waiting[depth]
         start, end = starts[node], ends[node]
-        _fill_box(boxes[node], placed, start, end)
-        if node >= leaves:
+        _fill_box(boxes[node], points, ordered, start, end)
+        if node >= nodes // 2:
             continue
         middle = (start + end) // 2
         axis = 0
         for k in range(1, 3):
             if boxes[node, 1, k] - boxes[node, 0, k] > boxes[node, 1, axis] - boxes[node, 0, axis]:
                 axis = k
-        _part(placed, rows, axis, start, end, middle)
+        _mark(ordered, points, axis, boxes[node, 0, axis], boxes[node, 1, axis], start, end)
+        _part(ordered, start, end, middle)
         starts[2 * node + 1], ends[2 * node + 1] = start, middle
         starts[2 * node + 2], ends[2 * node + 2] = middle, end
         waiting[depth], waiting[depth + 1] = 2 * node + 2, 2 * node + 1
         depth += 2
+    placed, rows = np.empty((count, 3)), np.empty(count, np.int64)
+    for i in range(count):
+        row = np.int64(ordered[i] & _ROW)
+        rows[i] = row
+        placed[i, 0], placed[i, 1], placed[i, 2] = points[row, 0], points[row, 1], points[row, 2]
     return Tree(placed, rows, starts, ends, boxes)
 
 
 @njit()
-def _fill_box(box, points, start, end):
-    """Make `box` (2, 3) that around the points from `start` to `end`."""
+def _fill_box(box, points, ordered, start, end):
+    """Make `box` (2, 3) that around the points whose rows are ordered from `start` to `end`."""
     ax, ay, az = np.inf, np.inf, np.inf
     bx, by, bz = -np.inf, -np.inf, -np.inf
     for i in range(start, end):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        row = np.int64(ordered[i] & _ROW)
+        x, y, z = points[row, 0], points[row, 1], points[row, 2]
         ax, ay, az, bx, by, bz = min(ax, x), min(ay, y), min(az, z), max(bx, x), max(by, y), max(bz, z)
     box[0, 0], box[0, 1], box[0, 2], box[1, 0], box[1, 1], box[1, 2] = ax, ay, az, bx, by, bz
+
+
+@njit()
+def _mark(ordered, points, axis, low, high, start, end):
+    """Put before each row from `start` to `end` where its point lies along an axis, in 2³² steps.
+
+    Points of one step are in the order of their rows, so that no two are equal.
+    """
+    scale = 4294967295.0 / (high - low) if high > low else 0.0
+    for i in range(start, end):
+        row = ordered[i] & _ROW
+        step = np.uint64((points[np.int64(row), axis] - low) * scale)
+        ordered[i] = (step << _HALF) | row
+
+
+@njit()
+def _part(ordered, start, end, middle):
+    """Reorder start..end so that nothing before `middle` is greater than anything after it.
+
+    Hoare's selection (1961), with Lomuto's way of parting: what is written does not depend on a comparison,
+    so that none is guessed wrong.
+    """
+    while end - start > _FEW:
+        quarter = (end - start) // 4
+        pivot = _median(ordered[start + quarter], ordered[(start + end) // 2], ordered[end - 1 - quarter])
+        below = start
+        for i in range(start, end):
+            own = ordered[i]
+            ordered[i] = ordered[below]
+            ordered[below] = own
+            below += 1 if own < pivot else 0
+        if below > middle:
+            end = below
+        else:
+            start = below
+    for i in range(start + 1, end):
+        own, at = ordered[i], i
+        while at > start and ordered[at - 1] > own:
+            ordered[at] = ordered[at - 1]
+            at -= 1
+        ordered[at] = own
 
 
 @njit()
@@ -119,32 +171,6 @@ def _moved(tree, points):
                 boxes[node, 0, k] = min(boxes[2 * node + 1, 0, k], boxes[2 * node + 2, 0, k])
                 boxes[node, 1, k] = max(boxes[2 * node + 1, 1, k], boxes[2 * node + 2, 1, k])
     return placed, boxes
-
-
-@njit()
-def _part(points, rows, axis, start, end, middle):
-    """Reorder start..end so that nothing before `middle` lies beyond anything after it (Hoare 1961)."""
-    left, right = start, end - 1
-    while left < right:
-        pivot = _median(points[left, axis], points[(left + right) // 2, axis], points[right, axis])
-        i, j = left, right
-        while i <= j:
-            while points[i, axis] < pivot:
-                i += 1
-            while points[j, axis] > pivot:
-                j -= 1
-            if i <= j:
-                for k in range(3):
-                    points[i, k], points[j, k] = points[j, k], points[i, k]
-                rows[i], rows[j] = rows[j], rows[i]
-                i += 1
-                j -= 1
-        if middle <= j:
-            right = j
-        elif middle >= i:
-            left = i
-        else:
-            return
 
 
 @njit(inline="always")
