@@ -186,19 +186,30 @@ def test_scans_agree_with_gtsam(folder, monkeypatch):
 
 # --- several minima ---
 
+def tried_twice_and_once(problem, config, min_matches: int, monkeypatch) -> list[tuple]:
+    """Answers with second tries of all components, which are small, and without."""
+    answers = [fast.solve(problem, config, min_matches)]
+    monkeypatch.setattr(fast, "_SMALL", 0)
+    return [*answers, fast.solve(problem, config, min_matches)]
+
+
+def astray(count: int, wrong_matches: float, noise_m: float):
+    """Bodies that hardly move, most matches of which are wrong: without truncation these lead them astray."""
+    motion = pose.from_translation([0.1, 0.0, 0.0])
+    return worlds.joined([
+        worlds.body((8.0, 2.0, 0.5), motion, rng(seed), wrong_matches, noise_m, 6, 4)
+        for seed in range(count)]).problem
+
+
 @both_frames
 def test_a_second_try_leaves_a_high_minimum(config, monkeypatch):
-    """Bodies that hardly move, most matches of which are wrong: without truncation these lead them astray."""
-    bodies = [worlds.body((8.0, 2.0, 0.5), pose.from_translation([0.1, 0.0, 0.0]), rng(seed), 0.7, 0.02, 6, 4)
-              for seed in range(12)]
-    problem = worlds.joined(bodies).problem
-    second, solved, stats = fast.solve(problem, config, MIN_MATCHES)
-    monkeypatch.setattr(fast, "_SMALL", 0)
-    first, solved_first, stats_first = fast.solve(problem, config, MIN_MATCHES)
+    problem = astray(12, 0.7, 0.02)
+    (second, solved, stats), (first, solved_first, stats_first) = tried_twice_and_once(
+        problem, config, MIN_MATCHES, monkeypatch)
     assert_allclose(stats.robust_final_error, energy(problem, second, config), rtol=1e-9)
     assert stats.robust_final_error < 0.97 * stats_first.robust_final_error
     assert (solved >= solved_first).all()
-    for c in range(len(bodies)):
+    for c in range(12):
         rows = np.flatnonzero(problem.component == c)
         found, before = (energy(problem.part(rows), motions[rows], config) for motions in (second, first))
         same = (second[rows] == first[rows]).all()
@@ -208,12 +219,9 @@ def test_a_second_try_leaves_a_high_minimum(config, monkeypatch):
 @pytest.mark.parametrize("min_matches", [3, 6, 9, 12])
 def test_a_second_try_loses_no_component(min_matches, monkeypatch):
     """What is lowest with too few matches is not taken: it would not count as solved."""
-    bodies = [worlds.body((8.0, 2.0, 0.5), pose.from_translation([0.1, 0.0, 0.0]), rng(seed), 0.6, 0.1, 6, 4)
-              for seed in range(30)]
-    problem = worlds.joined(bodies).problem
-    _, solved, _ = fast.solve(problem, POINT, min_matches)
-    monkeypatch.setattr(fast, "_SMALL", 0)
-    assert (solved >= fast.solve(problem, POINT, min_matches)[1]).all()
+    (_, solved, _), (_, solved_first, _) = tried_twice_and_once(
+        astray(30, 0.6, 0.1), POINT, min_matches, monkeypatch)
+    assert (solved >= solved_first).all()
 
 
 def test_near_matches_are_counted():

@@ -41,7 +41,7 @@ def build(points: np.ndarray, cell_m: float) -> Cells:
 @njit()
 def built(points, cell_m):
     """As `build`, for other kernels."""
-    place, _, number, counts = _hashed(points, cell_m)
+    place, number, counts = _hashed(points, cell_m)
     order, bounds = _by_number(number, counts)
     columns, table, column, heights = _hashed_places(place)
     stacked, stacks = _by_number(column, heights)
@@ -76,7 +76,7 @@ def _sort_by_height(cells, place):
 @njit()
 def numbered(points, cell_m):
     """The number (N,) of each point's cell, in the order they first appear, and how many each has (C,)."""
-    _, _, number, counts = _hashed(points, cell_m)
+    _, number, counts = _hashed(points, cell_m)
     return number, counts
 
 
@@ -105,7 +105,7 @@ def around(cells, place, near):
 
 @njit()
 def _hashed(points, cell_m):
-    """Places (C, 3) of the cells of points, a table of them, the cell (N,) of each, and their points (C,)."""
+    """Places (C, 3) of the cells of points, the cell (N,) of each, and how many points each has (C,)."""
     table, place = _room(len(points))
     number, counts = np.empty(len(points), np.int64), np.zeros(len(points), np.int64)
     found, cell = 0, -1
@@ -119,7 +119,7 @@ def _hashed(points, cell_m):
             found = max(found, cell + 1)
         number[i] = cell
         counts[cell] += 1
-    return place[:found].copy(), table, number, counts[:found].copy()
+    return place[:found].copy(), number, counts[:found].copy()
 
 
 @njit()
