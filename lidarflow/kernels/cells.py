@@ -17,8 +17,7 @@ class Cells(NamedTuple):
     place    (C, 3) int64     of each occupied cell: the floor of coordinates over cell_m
     order    (N,) int64       rows of the points, cell by cell, ascending in each
     bounds   (C + 1,) int64   where each cell begins in this order, and the end
-    columns  (D, 3) int64     places of the columns that hold cells, with z = 0
-    table    (S,) int32       column in each slot of the hash table, -1 = empty
+    table    (S, 4) int32     hash table of the columns that hold cells: x, y, 0 and which, -1 = empty
     stacked  (C,) int64       cells, column by column, each from the lowest up
     stacks   (D + 1,) int64   where each column begins among them, and the end
     """
@@ -27,7 +26,6 @@ class Cells(NamedTuple):
     place: np.ndarray
     order: np.ndarray
     bounds: np.ndarray
-    columns: np.ndarray
     table: np.ndarray
     stacked: np.ndarray
     stacks: np.ndarray
@@ -43,11 +41,11 @@ def built(points, cell_m):
     """As `build`, for other kernels."""
     place, number, counts = _hashed(points, cell_m)
     order, bounds = _by_number(number, counts)
-    columns, table, column, heights = _hashed_places(place)
+    table, column, heights = _columns(place)
     stacked, stacks = _by_number(column, heights)
     for k in range(len(heights)):
         _sort_by_height(stacked[stacks[k]: stacks[k + 1]], place)
-    return Cells(cell_m, place, order, bounds, columns, table, stacked, stacks)
+    return Cells(cell_m, place, order, bounds, table, stacked, stacks)
 
 
 @njit()
@@ -89,7 +87,7 @@ def around(cells, place, near):
     count = 0
     for x in range(place[0] - 1, place[0] + 2):
         for y in range(place[1] - 1, place[1] + 2):
-            column = cells.table[_slot(x, y, 0, cells.table, cells.columns)]
+            column = cells.table[_slot(x, y, 0, cells.table), 3]
             if column < 0:
                 continue
             for k in range(cells.stacks[column], cells.stacks[column + 1]):
@@ -106,65 +104,65 @@ def around(cells, place, near):
 @njit()
 def _hashed(points, cell_m):
     """Places (C, 3) of the cells of points, the cell (N,) of each, and how many points each has (C,)."""
-    table, place = _room(len(points))
+    table, place = _room(len(points)), np.empty((len(points), 3), np.int64)
     number, counts = np.empty(len(points), np.int64), np.zeros(len(points), np.int64)
-    found, cell = 0, -1
+    found, cell, lx, ly, lz = 0, -1, 0, 0, 0
     for i in range(len(points)):
         x = math.floor(points[i, 0] / cell_m)
         y = math.floor(points[i, 1] / cell_m)
         z = math.floor(points[i, 2] / cell_m)
         # Points that follow one another are often in one cell.
-        if cell < 0 or place[cell, 0] != x or place[cell, 1] != y or place[cell, 2] != z:
-            cell = _entered(x, y, z, table, place, found)
-            found = max(found, cell + 1)
+        if cell < 0 or x != lx or y != ly or z != lz:
+            lx, ly, lz = x, y, z
+            cell = _entered(x, y, z, table, found)
+            if cell == found:
+                place[cell, 0], place[cell, 1], place[cell, 2] = x, y, z
+                found += 1
         number[i] = cell
         counts[cell] += 1
     return place[:found].copy(), number, counts[:found].copy()
 
 
 @njit()
-def _hashed_places(place):
-    """Columns (D, 3) of places (C, 3), a table of them, the column (C,) of each, and their places (D,)."""
-    table, columns = _room(len(place))
-    number, counts = np.empty(len(place), np.int64), np.zeros(len(place), np.int64)
-    found = 0
+def _columns(place):
+    """A table of the columns of places (C, 3), the column (C,) of each, and how many each has (D,)."""
+    table = _room(len(place))
+    number, counts, found = np.empty(len(place), np.int64), np.zeros(len(place), np.int64), 0
     for i in range(len(place)):
-        number[i] = _entered(place[i, 0], place[i, 1], 0, table, columns, found)
+        number[i] = _entered(place[i, 0], place[i, 1], 0, table, found)
         found = max(found, number[i] + 1)
         counts[number[i]] += 1
-    return columns[:found].copy(), table, number, counts[:found].copy()
+    return table, number, counts[:found].copy()
 
 
 @njit()
 def _room(count):
-    """An empty hash table (S,) for as many cells, and room (count, 3) for their places."""
+    """An empty hash table (S, 4) for as many cells."""
     slots = 16
     while slots < 2 * count:
         slots *= 2
-    return np.full(slots, -1, np.int32), np.empty((count, 3), np.int64)
+    table = np.empty((slots, 4), np.int32)
+    table[:, 3] = -1
+    return table
 
 
 @njit(inline="always")
-def _entered(x, y, z, table, place, found):
-    """Number of the cell at x, y, z; the next, `found`, if it is not in the table yet."""
-    slot = _slot(x, y, z, table, place)
-    if table[slot] < 0:
-        table[slot] = found
-        place[found, 0], place[found, 1], place[found, 2] = x, y, z
-    return table[slot]
+def _entered(x, y, z, table, found):
+    """Number of the cell at x, y, z; the next, `found`, if it was not in the table yet."""
+    slot = _slot(x, y, z, table)
+    if table[slot, 3] < 0:
+        table[slot, 0], table[slot, 1], table[slot, 2], table[slot, 3] = x, y, z, found
+    return np.int64(table[slot, 3])
 
 
 @njit(inline="always")
-def _slot(x, y, z, table, place):
+def _slot(x, y, z, table):
     """Slot of a table that has the cell at x, y, z, or would have it.
 
     Large primes spread cells (Teschner et al. 2003); what is above is folded into the low bits.
     """
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
     slot = (mixed ^ (mixed >> 17)) & (len(table) - 1)
-    while table[slot] >= 0:
-        cell = table[slot]
-        if place[cell, 0] == x and place[cell, 1] == y and place[cell, 2] == z:
-            break
+    while table[slot, 3] >= 0 and (table[slot, 0] != x or table[slot, 1] != y or table[slot, 2] != z):
         slot = (slot + 1) & (len(table) - 1)
     return slot
