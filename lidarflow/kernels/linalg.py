@@ -6,6 +6,9 @@ import numpy as np
 
 from lidarflow.kernels.compiled import njit
 
+_RISE = 2.0 / math.sqrt(3.0)    # of the least root of t³ - 3 t = 2 - 4 u², as u leaves 0
+_NO_SLOPE = 1e-30               # where two roots meet
+
 
 @njit()
 def symmetric_eigen3(a00, a01, a02, a11, a12, a22, values, vectors):
@@ -52,9 +55,11 @@ def symmetric_eigen3(a00, a01, a02, a11, a12, a22, values, vectors):
 
 @njit()
 def plane_eigen3(a00, a01, a02, a11, a12, a22, values, normal):
-    """Eigenvalues (3,) ascending, and the unit eigenvector (3,) of the least, in closed form (Smith 1961).
+    """Eigenvalues (3,) ascending, and the unit eigenvector (3,) of the least (after Smith 1961).
 
-    As good as iterating where the least is apart from the others; where it is not, no direction means much.
+    Less their mean and over their spread, eigenvalues are the roots of t³ - 3 t = d, where d is a
+    determinant; Newton's steps to the least one take less than its cosine. As good as rotations where the
+    least is apart from the others; where it is not, no direction means much.
     """
     mean = (a00 + a11 + a22) / 3.0
     b00, b11, b22 = a00 - mean, a11 - mean, a22 - mean
@@ -65,9 +70,13 @@ def plane_eigen3(a00, a01, a02, a11, a12, a22, values, normal):
         return
     half_det = 0.5 * (b00 * (b11 * b22 - a12 * a12) - a01 * (a01 * b22 - a12 * a02)
                       + a02 * (a01 * a12 - b11 * a02)) / (spread * spread * spread)
-    angle = math.acos(min(max(half_det, -1.0), 1.0)) / 3.0
-    values[2] = mean + 2.0 * spread * math.cos(angle)
-    values[0] = mean + 2.0 * spread * math.cos(angle + 2.0 * math.pi / 3.0)
+    half_det = min(max(half_det, -1.0), 1.0)
+    u = math.sqrt(0.5 - 0.5 * half_det)
+    t = -1.0 - (_RISE - (_RISE - 1.0) * u) * u     # right where u is 0 or 1, and how it begins
+    for _ in range(3):
+        t -= (t * t * t - 3.0 * t - 2.0 * half_det) / max(3.0 * t * t - 3.0, _NO_SLOPE)
+    values[0] = mean + spread * t
+    values[2] = mean + 0.5 * spread * (math.sqrt(max(12.0 - 3.0 * t * t, 0.0)) - t)
     values[1] = 3.0 * mean - values[0] - values[2]
     # It is across all rows of A - λ I; the two that are least alike tell it best.
     c00, c11, c22 = a00 - values[0], a11 - values[0], a22 - values[0]
