@@ -292,9 +292,9 @@ def test_bodies_grow_step_by_step_and_each_as_if_alone():
     starts = [pose.from_translation(shift) for shift in ([0.55, 0.03, 0.0], [0.6, 0.0, 0.0], [0.6, 0.0, 0.0])]
     free = np.ones(len(view.points), bool)
     free[on_box[:100]] = False
-    found = body_of.grown(view, seeds, starts, free, CONFIG)
+    found = body_of.grown(view, seeds, starts, free, 0.0, CONFIG)
     for seed, start, growth in zip(seeds, starts, found, strict=True):
-        alone, = body_of.grown(view, [seed], [start], free, CONFIG)
+        alone, = body_of.grown(view, [seed], [start], free, 0.0, CONFIG)
         expected = grown_twin(view, seed, start, free)
         np.testing.assert_array_equal(growth.asked, alone.asked)
         assert (growth.body is None) == (expected is None) == (alone.body is None)
@@ -302,6 +302,11 @@ def test_bodies_grow_step_by_step_and_each_as_if_alone():
             np.testing.assert_array_equal(growth.body.rows, expected.rows)
             np.testing.assert_allclose(growth.body.over_ground, expected.over_ground, atol=1e-9)
             assert growth.asked[growth.body.rows].all() and free[growth.body.rows].all()
+    least_m = np.linalg.norm(found[0].body.over_ground[:2, 3])
+    slower, = body_of.grown(view, seeds[:1], starts[:1], free, least_m - 0.01, CONFIG)
+    np.testing.assert_array_equal(slower.body.rows, found[0].body.rows)
+    given_up, = body_of.grown(view, seeds[:1], starts[:1], free, least_m + 0.01, CONFIG)
+    assert given_up.body is None and given_up.asked.any()
     assert found[0].body is not None and len(found[0].body.rows) > 0.8 * (len(on_box) - 100)
 
 

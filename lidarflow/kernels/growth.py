@@ -38,6 +38,7 @@ class Limits(NamedTuple):
     min_points, link_m               a body hangs together at this distance, and has so many points
     clearly_better_m, as_good_m      differences between distances that count, and that do not
     cap_m, min_agreement             of distances, as in misfit.after
+    least_shift_m                    what its motion shifts less along the ground is given up
     """
 
     first_reach_m: float
@@ -49,6 +50,7 @@ class Limits(NamedTuple):
     as_good_m: float
     cap_m: float
     min_agreement: float
+    least_shift_m: float
 
 
 class Fit(NamedTuple):
@@ -117,7 +119,9 @@ def _grow(
             rows = _hanging_together(rows, own.points, is_seed, limits.link_m)
         if len(rows) < limits.min_points:
             return
-        _fit(rows, own, target, target_normals, ground, limits, fit, gates_m, motion)
+        shift_m = _fit(rows, own, target, target_normals, ground, limits, fit, gates_m, motion)
+        if shift_m < limits.least_shift_m:
+            return
     did[rows] = TAKEN
 
 
@@ -176,7 +180,7 @@ def _hanging_together(rows, points, is_seed, link_m):
 
 @njit()
 def _fit(rows, own, target, target_normals, ground, limits, fit, gates_m, motion):
-    """Bring `motion` (4, 4) to that of the rows onto the target's planes."""
+    """Bring `motion` (4, 4) to that of the rows onto the target's planes; returns their shift along x, y."""
     points = own.points[rows]
     if len(rows) > fit.voxel_points:
         rows = rows[grid.first_of_each(points, fit.voxel_m)]
@@ -188,6 +192,8 @@ def _fit(rows, own, target, target_normals, ground, limits, fit, gates_m, motion
         points, own.normals[rows], target, target_normals, math.atan2(motion[1, 0], motion[0, 0]), shift,
         gates_m, _ground_normal(ground, centre, fit), fit.along_ground, fit.plane_scale_m, fit.point_scale_m,
         fit.point_weight, limits.min_agreement)
+    x, y, _ = moved(centre, motion)
+    return math.hypot(x - centre[0], y - centre[1])
 
 
 @njit()

@@ -41,7 +41,7 @@ class Body:
 class Growth:
     """How a body grew.
 
-    body   Body or None   None if it stayed too small
+    body   Body or None   None if it stayed too small, or is too slow
     asked  (N,) bool      the rows of the view that were asked whether they belong to it
     """
 
@@ -50,13 +50,14 @@ class Growth:
 
 
 def grown(
-    view: View, seeds: list[np.ndarray], starts: list[np.ndarray], free: np.ndarray, config: ObjectsConfig
+    view: View, seeds: list[np.ndarray], starts: list[np.ndarray], free: np.ndarray, least_m: float,
+    config: ObjectsConfig,
 ) -> list[Growth]:
     """The bodies around `seeds`, rows (K,) each, that move by about `starts` (4, 4), each as if alone.
 
     A body looks at what is near to its seeds, keeps what agrees with its motion and hangs together with a
     seed, fits the motion to that, and looks around again, until it comes near nothing new. Only rows that are
-    `free` (N,) may be taken.
+    `free` (N,) may be taken. One that its motion shifts by less than `least_m` along the ground is given up.
 
     The side of a car that moves along itself is explained by either motion, and belongs to the car when
     the car's motion explains it about as well: a row agrees that the motion explains clearly better, or in
@@ -68,7 +69,7 @@ def grown(
         view.points, view.source.normals, view.tolerance_m, view.by_ego.distance_m, view.by_ego.plane_m)
     limits = growth.Limits(
         _FIRST_REACH_M, _REACH_M, _GROWTH_ROUNDS, config.min_points, _LINK_M, _CLEARLY_BETTER_M, _AS_GOOD_M,
-        CAP_M, MIN_AGREEMENT)
+        CAP_M, MIN_AGREEMENT, least_m)
     did, motions = growth.grow_each(
         *rigid_fit.concatenated(seeds), np.stack(starts), free, view.source.tree, own, view.upright.tree,
         view.upright.normals, view.ground, limits, _FIT._replace(along_ground=float(config.along_ground)),

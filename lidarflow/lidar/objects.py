@@ -17,7 +17,8 @@ from lidarflow.lidar.view import View
 from lidarflow.types import MovingObject
 
 _MAX_SHIFT_M = 3.0        # over ground and between scans: 30 m/s at 10 Hz
-_MAX_START_RATIO = 0.7   # of the squared misfit that ego-motion leaves
+_MAX_START_RATIO = 0.55  # of the squared misfit that ego-motion leaves; moving objects begin below 0.45
+_MIN_START_SPEED = 0.5   # share of the least speed; points that follow the rings make a start too slow
 _DISTANCE_WEIGHT = 0.3   # of squared distances to points, where those to planes have 1
 _MAX_START_POINTS = 300  # as many choose the start; the fit that follows uses all
 
@@ -31,7 +32,8 @@ def find(
     `expected` is what earlier pairs lead to expect: it is looked for where it should be, and believed no
     more easily than the rest. `each` judges candidates, several at a time if it can.
     """
-    starts = _best_starts(view, found, found.clusters, expected)
+    least_m = _MIN_START_SPEED * config.min_speed_m_per_s * dt_s
+    starts = _best_starts(view, found, found.clusters, expected, least_m)
     bodies, free = [], np.ones(len(view.points), bool)
     # All are looked at as if each were alone; who meets what another has taken is looked at again.
     moving = [number for number, start in enumerate(starts) if start is not None]
@@ -42,7 +44,7 @@ def find(
     for number, (cluster, start) in enumerate(zip(found.clusters, starts, strict=True)):
         mine = cluster[free[found.rows[cluster]]]
         if len(mine) < len(cluster):
-            start, = _best_starts(view, found, (mine,), expected)
+            start, = _best_starts(view, found, (mine,), expected, least_m)
         if start is None:
             continue
         candidate = alone.get(number)
@@ -60,7 +62,7 @@ def _candidates(
     config: ObjectsConfig, each: Each,
 ) -> list[Growth]:
     """What grows of seeds, rows (K,) each, over the rows that are `free` (N,), and moves."""
-    grown = body.grown(view, seeds, starts, free, config)
+    grown = body.grown(view, seeds, starts, free, _MIN_START_SPEED * config.min_speed_m_per_s * dt_s, config)
     grown = _those(grown, lambda own: seems_to_move(view, own, dt_s, config), each)
     _match_at_once(view, grown)
     grown = _those(grown, lambda own: matches_agree(view, own, config), one_by_one)
@@ -102,11 +104,12 @@ def describe(
 
 def _best_starts(
     view: View, found: seeds.Seeds, clusters: tuple[np.ndarray, ...],
-    expected: hypotheses.Expected,
+    expected: hypotheses.Expected, least_m: float,
 ) -> list[np.ndarray | None]:
     """For each cluster of seeds, the motion (4, 4) that explains it best, from what is proposed for it.
 
-    None where there are too few seeds, or none explains them clearly better than ego-motion does.
+    None where there are too few seeds, none explains them clearly better than ego-motion does, or the one
+    that does moves them less than `least_m` along the ground.
     """
     chosen = [hypotheses.spread(cluster, _MAX_START_POINTS) for cluster in clusters]
     rows = [found.rows[cluster] for cluster in chosen]
@@ -124,8 +127,13 @@ def _best_starts(
     best = []
     for number, own in enumerate(rows):
         mine = np.flatnonzero(group == number)
-        clear = len(mine) and left_sq[mine].min() <= _MAX_START_RATIO * _misfit_sq(view.by_ego[own])
-        best.append(fits[mine[np.argmin(left_sq[mine])]] if clear else None)
+        start = None
+        if len(mine) and left_sq[mine].min() <= _MAX_START_RATIO * _misfit_sq(view.by_ego[own]):
+            start = fits[mine[np.argmin(left_sq[mine])]]
+            centre = view.points[own].mean(axis=0)
+            if np.hypot(*(pose.apply(start, centre[None]) - centre)[0, :2]) < least_m:
+                start = None
+        best.append(start)
     return best
 
 
