@@ -142,29 +142,36 @@ def _newly_asked(rows, did, nearest):
 def _agreeing(near, free, motion, own, target, target_normals, ground, limits, nearest):
     """The free ones of the rows that the motion explains clearly better, or in place and about as well."""
     rows, count = np.empty(len(near), np.int64), 0
-    better_m, as_good_m = limits.clearly_better_m, limits.as_good_m
     for row in near:
         if not free[row]:
             continue
-        ego_m, ego_plane_m = own.by_ego_m[row], own.by_ego_plane_m[row]
         x, y, z = moved(own.points[row], motion)
         place, apart_sq = icp.follow(target, x, y, z, 2.0 * limits.cap_m, row, nearest)
-        if math.sqrt(apart_sq) < ego_m - better_m:     # whatever ground or planes say
-            rows[count] = row
-            count += 1
-            continue
-        own_m, plane_m = misfit.beyond_nearest(
-            x, y, z, place, apart_sq, own.normals[row], motion, target, target_normals, ground, limits.cap_m,
-            limits.min_agreement)
-        fits = own_m <= own.tolerance_m[row]
-        better = own_m < ego_m - better_m
-        plane_better = fits and plane_m < ego_plane_m - as_good_m
-        as_good = fits and own_m < ego_m + as_good_m and plane_m < ego_plane_m + better_m
-        plane_worse = plane_m > ego_plane_m + as_good_m and not better
-        if (better or plane_better or as_good) and not plane_worse:
+        plane_m = misfit.plane_distance(
+            x, y, z, place, own.normals[row], motion, target, target_normals, limits.min_agreement)
+        own_m = min(math.sqrt(apart_sq), limits.cap_m)
+        agrees = _is_explained(own_m, min(plane_m, own_m), row, own, limits)
+        if not agrees:     # near ground speaks for a motion, never against it
+            below, ground_sq = trees.nearest(ground, x, y, z, own_m * own_m, -1)
+            own_m = math.sqrt(ground_sq)
+            agrees = below >= 0 and _is_explained(own_m, min(plane_m, own_m), row, own, limits)
+        if agrees:
             rows[count] = row
             count += 1
     return rows[:count]
+
+
+@njit()
+def _is_explained(own_m, plane_m, row, own, limits):
+    """Whether a row agrees with a motion that leaves it so far from the target, and from its plane."""
+    ego_m, ego_plane_m = own.by_ego_m[row], own.by_ego_plane_m[row]
+    better_m, as_good_m = limits.clearly_better_m, limits.as_good_m
+    if own_m < ego_m - better_m:     # whatever planes say
+        return True
+    if own_m > own.tolerance_m[row] or plane_m > ego_plane_m + as_good_m:
+        return False
+    plane_better = plane_m < ego_plane_m - as_good_m
+    return plane_better or (own_m < ego_m + as_good_m and plane_m < ego_plane_m + better_m)
 
 
 @njit()

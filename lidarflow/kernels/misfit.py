@@ -81,25 +81,25 @@ def after_one(point, normal, motion, target, target_normals, beside, cap_m, min_
     """As `after`, of one point (3,) with a normal (3,): its distance and its plane distance."""
     x, y, z = moved(point, motion)
     place, apart_sq = trees.nearest(target, x, y, z, 4.0 * cap_m * cap_m, -1)
-    return beyond_nearest(x, y, z, place, apart_sq, normal, motion, target, target_normals, beside, cap_m,
-                          min_agreement)
+    _, nearest_sq = trees.nearest(beside, x, y, z, min(apart_sq, cap_m * cap_m), -1)
+    distance_m = math.sqrt(nearest_sq)
+    plane_m = plane_distance(x, y, z, place, normal, motion, target, target_normals, min_agreement)
+    return distance_m, min(plane_m, distance_m)
 
 
 @njit()
-def beyond_nearest(
-    x, y, z, place, apart_sq, normal, motion, target, target_normals, beside, cap_m, min_agreement
-):
-    """As `after_one`, of a point moved to x, y, z whose nearest place in `target` is known, -1 = none."""
-    _, nearest_sq = trees.nearest(beside, x, y, z, min(apart_sq, cap_m * cap_m), -1)
-    distance_m = math.sqrt(nearest_sq)
-    if place >= 0:
-        plane = target_normals[target.rows[place]]
-        nx, ny, nz = turned(normal, motion)
-        if agree(plane, nx, ny, nz, min_agreement):
-            at = target.points[place]
-            offset_m = abs(plane[0] * (at[0] - x) + plane[1] * (at[1] - y) + plane[2] * (at[2] - z))
-            return distance_m, min(offset_m, distance_m)
-    return distance_m, distance_m
+def plane_distance(x, y, z, place, normal, motion, target, target_normals, min_agreement):
+    """How far x, y, z is from the plane at a place of the target; infinite without one, or if normals differ.
+
+    The normal (3,) is that of the point before a motion (4, 4) took it there.
+    """
+    if place < 0:
+        return math.inf
+    plane, at = target_normals[target.rows[place]], target.points[place]
+    nx, ny, nz = turned(normal, motion)
+    if not agree(plane, nx, ny, nz, min_agreement):
+        return math.inf
+    return abs(plane[0] * (at[0] - x) + plane[1] * (at[1] - y) + plane[2] * (at[2] - z))
 
 
 def mean_sq_after(points, normals, rows, bounds, group, motions, target, target_normals, beside, cap_m,
