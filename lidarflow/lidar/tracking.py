@@ -58,9 +58,9 @@ def identify(tracks: Tracks, clouds: list[np.ndarray]) -> list[int]:
     overlaps = []
     places = [tree.build(track.points) for track in tracks.followed]
     for number, points in enumerate(clouds):
-        sample = spread(points, _MAX_POINTS)
+        sample = tree.build(spread(points, _MAX_POINTS))
         for track, place in zip(tracks.followed, places, strict=True):
-            share = len(neighbours.near_rows(tree.build(sample), place, _SAME_PLACE_M)) / len(sample)
+            share = len(neighbours.near_rows(sample, place, _SAME_PLACE_M)) / len(sample.rows)
             if share >= _MIN_SHARE:
                 overlaps.append((-share, number, track.id))
     ids: dict[int, int] = {}
