@@ -116,7 +116,7 @@ class SolverConfig:
 @dataclass(frozen=True, slots=True)
 class RefineConfig:
     rounds: int = setting(
-        3, "how often near, small things are drawn to the next scan's surface; 0 = never", low=0)
+        2, "how often near, small things are drawn to the next scan's surface; 0 = never", low=0)
     max_size_m: float = setting(
         2.5, "things larger than this, in any direction, have no limbs and stay as they are", low=0)
     max_range_m: float = setting(
