@@ -16,7 +16,7 @@ from lidarflow import config as settings
 from lidarflow import pipeline, pose
 from lidarflow.config import SolverConfig
 from lidarflow.datasets import open_dataset
-from lidarflow.kernels import pose_graph, twist_errors
+from lidarflow.kernels import parts, pose_graph, twist_errors
 from lidarflow.solve import fast, gtsam_lm
 from lidarflow.types import ScanPair
 
@@ -45,7 +45,8 @@ def linearised(problem, config: SolverConfig, robust: bool):
     """Energy and gradient (M, 6) at the start of a problem of one component, its factors and variables."""
     count = len(problem.points)
     edges = problem.edges[np.lexsort(problem.edges.T[::-1])]
-    factors = fast.factors_of(problem, np.arange(count), np.arange(count), problem.points, edges, config)
+    factors = pose_graph.factors_of(
+        fast.graph_of(problem), fast.weights_of(config), np.arange(count, dtype=np.int32), edges)
     variables = pose_graph.variables_of(problem.initial, np.arange(count), problem.points)
     found, gradient = evaluated(factors, variables, robust)
     return found, gradient, factors, variables
@@ -55,9 +56,9 @@ def evaluated(factors, variables, robust: bool):
     """Energy and gradient (M, 6) of variables (M, 7)."""
     count = len(variables)
     gradient, active = np.empty((count, 6)), np.empty(count, np.uint8)
-    nodes, edges, block = (0, count), (0, len(factors.edges)), twist_errors.room()
-    smooth = pose_graph.smoothness(factors, variables, nodes, edges, block, gradient)
-    return smooth + pose_graph.evidence(factors, variables, nodes, robust, block, gradient, active), gradient
+    block = twist_errors.room()
+    smooth = pose_graph.smoothness(factors, variables, block, gradient)
+    return smooth + pose_graph.evidence(factors, variables, robust, block, gradient, active), gradient
 
 
 # --- energy and derivatives ---
@@ -90,7 +91,7 @@ def test_the_gradient_is_the_numerical_one(config, robust, shift_m, turn_deg):
         ends = []
         for size in (1e-6, -1e-6):
             moved = np.empty_like(variables)
-            pose_graph.step(variables, (0, count), size * twists, moved)
+            pose_graph.step(variables, size * twists, moved)
             ends.append(evaluated(factors, moved, robust)[0])
         assert_allclose((gradient * twists).sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-4, atol=1e-4)
 
@@ -118,9 +119,25 @@ def test_variables_give_back_the_motions():
 
 
 def test_edges_are_between_places_and_sorted():
-    edges = np.array([[0, 5], [1, 2], [0, 3], [4, 6], [1, 7], [2, 7]], np.int32)
+    edges = np.array([[0, 5], [1, 2], [0, 3], [1, 7], [2, 7]], np.int32)
     place = np.array([2, 0, 1, 4, -1, 3, -1, 2], np.int32)
     assert pose_graph.edges_between(edges, place, 5).tolist() == [[0, 1], [0, 2], [1, 2], [2, 3], [2, 4]]
+
+
+def test_wanted_components_are_split_from_each_other():
+    random = rng(6)
+    component = random.integers(0, 7, 60).astype(np.int32)
+    pairs = np.stack(np.triu_indices(60, 1), axis=1).astype(np.int32)
+    edges = random.permutation(pairs[component[pairs[:, 0]] == component[pairs[:, 1]]])
+    wanted = np.array([True, False, True, True, False, True, True, True])    # the last has no variables
+    found = parts.split(component, edges, wanted)
+    for c, label in enumerate(np.flatnonzero(wanted)):
+        rows = found.rows[found.bounds[c]:found.bounds[c + 1]]
+        assert (rows == np.flatnonzero(component == label)).all()
+        assert (found.place[rows] == np.arange(len(rows))).all()
+        between = found.edges[found.edge_bounds[c]:found.edge_bounds[c + 1]]
+        assert (between == edges[component[edges[:, 0]] == label]).all()
+    assert found.bounds[-1] == wanted[component].sum() and found.edge_bounds[-1] == len(found.edges)
 
 
 # --- agreement with gtsam ---
@@ -232,7 +249,7 @@ def test_near_matches_are_counted():
     off_m = pose.apply(problem.initial[problem.match_index], problem.points[problem.match_index])
     near = ((off_m - problem.match_target) ** 2).sum(axis=1) <= POINT.truncation_m**2
     assert 0 < near.sum() < len(near)
-    counts = pose_graph.near_matches(factors, variables, (0, len(variables)))
+    counts = pose_graph.near_matches(factors, variables)
     assert counts == (near.sum(), len(near))
 
 
@@ -270,3 +287,22 @@ def test_fresh_code_gives_what_cached_code_gives(tmp_path):
     fresh = answer(1, NUMBA_CACHE_DIR=str(tmp_path))
     assert any(tmp_path.rglob("*.nbc"))
     assert fresh == answer(1, NUMBA_CACHE_DIR=str(tmp_path)) == answer(1)
+
+
+INTERPRETED = """
+import sys
+import numpy as np
+from lidarflow.solve import fast
+from test_fast_solver import POINT, astray
+motions, _, stats = fast.solve(astray(2, 0.4, 0.05), POINT, 3)
+np.save(sys.argv[1], np.append(motions.ravel(), stats.robust_final_error))
+"""
+
+
+def test_the_solver_is_plain_python_underneath(tmp_path):
+    file = tmp_path / "answer.npy"
+    subprocess.run(
+        [sys.executable, "-c", INTERPRETED, str(file)], check=True, capture_output=True, text=True,
+        env={**with_paths(ROOT / "tests"), "NUMBA_DISABLE_JIT": "1"})
+    motions, _, stats = fast.solve(astray(2, 0.4, 0.05), POINT, 3)
+    assert_allclose(np.load(file), np.append(motions.ravel(), stats.robust_final_error), atol=1e-8)

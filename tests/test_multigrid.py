@@ -69,26 +69,22 @@ def test_inertias_are_blocks_of_the_normal_equations():
     assert_allclose(inertia.twist(inverse, 0, *wrench), twist, atol=1e-9)
 
 
-def meshes(*shapes):
-    """Points, sorted edges and bounds of several room grids."""
-    grids = [worlds.room_grid((9.0 + 3 * k, 2.0, 0.0), *shape) for k, shape in enumerate(shapes)]
-    bounds = np.cumsum([0] + [len(grid) for grid in grids])
-    edges = np.concatenate([
-        worlds.grid_edges(*shape) + first for shape, first in zip(shapes, bounds[:-1], strict=True)])
-    return np.concatenate(grids), edges[np.lexsort(edges.T[::-1])].astype(np.int32), bounds
+def mesh(shape):
+    """Points (M, 3) and sorted edges (E, 2) of a room grid."""
+    points, edges = worlds.room_grid((9.0, 2.0, 0.0), *shape), worlds.grid_edges(*shape)
+    return points, edges[np.lexsort(edges.T[::-1])].astype(np.int32)
 
 
-def prepared(at_sensor: bool, *shapes):
+def prepared(at_sensor: bool, shape):
     """A hierarchy with random evidence, ready to solve, and the dense normal equations of the points' edges
     and of what holds the points."""
-    points, edges, bounds = meshes(*shapes)
-    levels = hierarchy.build(edges, bounds, STIFFNESS)
+    points, edges = mesh(shape)
+    levels = hierarchy.build(edges, len(points), STIFFNESS)
     levels.lever[:] = 0.1 * points if at_sensor else points
     room = multigrid.room_for(levels)
     active = rng(5).integers(0, 4, len(points)).astype(np.uint8)
-    for c in range(len(shapes)):
-        hierarchy.weigh(levels, c)
-        multigrid.hold(levels, room, c, points, active, DATA, TIE, DAMPING)
+    hierarchy.weigh(levels)
+    multigrid.hold(levels, room, points, active, DATA, TIE, DAMPING)
     joined, held = np.zeros((2, len(points), 6, len(points), 6))
     for i, j in edges:
         block = at(levels.lever[j], STIFFNESS, STIFFNESS)
@@ -100,28 +96,31 @@ def prepared(at_sensor: bool, *shapes):
     return levels, room, joined.reshape(6 * len(points), -1), held.reshape(6 * len(points), -1)
 
 
-def test_the_hierarchy_joins_neighbours_until_no_edge_is_left():
-    _, edges, bounds = meshes((40, 20), (5, 4), (2, 1), (1, 1))
-    levels = hierarchy.build(edges, bounds, STIFFNESS)
-    owner = np.full(len(levels.parent), -1)
-    for row in levels.bounds:
-        for c in range(len(bounds) - 1):
-            owner[row[c]:row[c + 1]] = c
-    assert (owner >= 0).all()
-    has_parent = levels.parent >= 0
-    assert (owner[levels.parent[has_parent]] == owner[has_parent]).all()
-    sizes = np.diff(levels.bounds, axis=1)
-    for c, size in enumerate(sizes.T):
-        count = multigrid.levels_of(levels, c)
-        assert (size[:count] > 0).all() and (size[count:] == 0).all() and size[count - 1] == 1
-        assert (size[1:count] <= 0.5 * size[:count - 1]).all()
-    assert multigrid.levels_of(levels, 3) == 1 and multigrid.levels_of(levels, 0) >= 4
+@pytest.mark.parametrize(("shape", "least"), [((40, 20), 4), ((5, 4), 2), ((2, 1), 2), ((1, 1), 1)])
+def test_the_hierarchy_joins_neighbours_until_no_edge_is_left(shape, least):
+    points, edges = mesh(shape)
+    levels = hierarchy.build(edges, len(points), STIFFNESS)
+    sizes = np.diff(levels.bounds)
+    assert len(sizes) >= least and sizes[0] == len(points) and sizes[-1] == 1
+    assert (sizes[1:] <= 0.5 * sizes[:-1]).all()
+    level = np.repeat(np.arange(len(sizes)), sizes)
+    assert (level[levels.parent[:-1]] == level[:-1] + 1).all() and levels.parent[-1] == -1
+    assert set(levels.parent[:-1]) == set(range(len(points), len(level)))
+    ends = [(i, j) for i in range(len(level)) for j in levels.up[levels.up_start[i]:levels.up_start[i + 1]]]
+    downs = [(j, i) for i in range(len(level))
+             for j in levels.down[levels.down_start[i]:levels.down_start[i + 1]]]
+    assert [ends[e] for e in levels.down_edge] == downs
+    for e, (i, j) in enumerate(ends):
+        assert i < j and level[i] == level[j]
+        parents = {levels.parent[i], levels.parent[j]}
+        assert (levels.edge_parent[e] < 0) == (len(parents) == 1)
+        assert len(parents) == 1 or set(ends[levels.edge_parent[e]]) == parents
 
 
 @pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
 def test_coarse_equations_are_sums_of_the_fine_ones(at_sensor):
-    levels, room, joined, held = prepared(at_sensor, (9, 7), (4, 3))
-    first, second, third = (np.arange(row[0], row[-1]) for row in levels.bounds[:3])
+    levels, room, joined, held = prepared(at_sensor, (9, 7))
+    first, second, third = (np.arange(*levels.bounds[k:k + 2]) for k in range(3))
     for fine, coarse in ((first, second), (second, third)):
         members = np.zeros((len(fine), len(coarse)))
         kept = levels.parent[fine] >= 0
@@ -148,7 +147,7 @@ def test_the_cycle_is_a_symmetric_preconditioner(at_sensor):
     columns = []
     for k in range(6 * count):
         room.loads[:count] = np.eye(6 * count)[k].reshape(-1, 6)
-        multigrid.cycle(levels, room, 0)
+        multigrid.cycle(levels, room)
         columns.append(room.twists[:count].ravel().copy())
     inverse = np.stack(columns, axis=1)
     assert_allclose(inverse, inverse.T, atol=1e-9 * np.abs(inverse).max())
@@ -157,16 +156,16 @@ def test_the_cycle_is_a_symmetric_preconditioner(at_sensor):
 
 
 @pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
-def test_steps_solve_the_normal_equations(at_sensor):
-    levels, room, joined, held = prepared(at_sensor, (16, 9), (3, 3), (1, 1))
+@pytest.mark.parametrize("shape", [(16, 9), (3, 3), (1, 1)])
+def test_steps_solve_the_normal_equations(at_sensor, shape):
+    levels, room, joined, held = prepared(at_sensor, shape)
     matrix = joined + held
     count = len(matrix) // 6
     gradient = rng(6).normal(size=(count, 6))
-    for c in range(3):
-        assert multigrid.solve(levels, room, c, gradient, 1e-24, 0.0, 0.0, 200) < 60
+    assert multigrid.solve(levels, room, gradient, 1e-24, 0.0, 0.0, 200) < 60
     expected = -np.linalg.solve(matrix, gradient.ravel()).reshape(-1, 6)
     assert_allclose(room.step, expected, atol=1e-7 * np.abs(expected).max())
-    assert multigrid.solve(levels, room, 0, gradient, 1e-24, 0.0, 1e9, 200) == -1   # not enough to gain
+    assert multigrid.solve(levels, room, gradient, 1e-24, 0.0, 1e9, 200) == -1   # not enough to gain
 
 
 @pytest.mark.parametrize("at_sensor", [False, True], ids=["point", "sensor"])
@@ -176,9 +175,9 @@ def test_directions_come_with_their_product(at_sensor, shape):
     count = len(levels.lever)
     for share in (0.0, 0.3):
         room.loads[:count] = rng(7).normal(size=(count, 6))
-        multigrid.cycle(levels, room, 0)
+        multigrid.cycle(levels, room)
         last = room.direction.copy()
-        total = multigrid._turn(levels, room, 0, count, share)
+        total = multigrid._turn(levels, room, share)
         expected = room.twists[:count] + (share * last if share else 0.0)
         assert_allclose(room.direction, expected, rtol=1e-12)
         product = (joined + held) @ expected.ravel()
@@ -189,6 +188,6 @@ def test_directions_come_with_their_product(at_sensor, shape):
 def test_negligible_gains_end_the_iterations():
     levels, room, _, _ = prepared(False, (16, 9))
     gradient = rng(6).normal(size=(len(levels.lever), 6))
-    counts = [multigrid.solve(levels, room, 0, gradient, 1e-12, little, 0.0, 200)
+    counts = [multigrid.solve(levels, room, gradient, 1e-12, little, 0.0, 200)
               for little in (0.0, 0.01, 1e9)]
     assert counts[0] > counts[1] > counts[2] == 0

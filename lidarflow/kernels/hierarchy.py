@@ -5,7 +5,7 @@ that of all its points as it is, and the coarse equations are sums of the fine o
 mesh gives way only where aggregates meet, and is too stiff (Braess 1995): its edges count less. What holds a
 node where it is counts in full, so that rigid motions are right on every level.
 
-All levels are in one list of nodes, level after level, and within each level component after component.
+All levels are in one list of nodes, level after level.
 """
 
 from collections import namedtuple
@@ -17,89 +17,94 @@ from lidarflow.kernels.inertia import SIZE, add_at
 
 _SOFTENING = 0.5    # share of the sum of edges that counts for the coarser one
 
-# bounds (L, C + 1): first node of every component on every level; the level after a component's last one
-# has no nodes of it. Neighbours of node i with higher numbers are up[up_start[i]:up_start[i + 1]], the edges
-# to them up_edge[…], which just counts; those with lower numbers are down[…], and down_edge[…]. parent (N,)
-# is the coarser node, edge_parent (E,) the coarser edge, -1 = none. stiffness is the weight of an edge.
-# lever (M, 3) is where an edge to a point from an earlier one sees twists. `weigh` fills the rest: inertias
-# (E', 10) of the edges beyond the first level, incident (N, 10) sums over the edges of a node.
+# bounds (L + 1,): first node of every level, and the end. Neighbours of node i with higher numbers are
+# up[up_start[i]:up_start[i + 1]], the edges to them up_edge[…], which just counts; those with lower numbers
+# are down[…], and down_edge[…]. parent (N,) is the coarser node, edge_parent (E,) the coarser edge, -1 =
+# none. stiffness is the weight of an edge. lever (M, 3) is where an edge to a point from an earlier one sees
+# twists. `weigh` fills the rest: inertias (E', 10) of the edges beyond the first level, incident (N, 10) sums
+# over the edges of a node.
 Hierarchy = namedtuple("Hierarchy", (
     "bounds", "up_start", "up", "up_edge", "down_start", "down", "down_edge", "parent", "edge_parent",
     "stiffness", "lever", "inertias", "incident"))
 
 
-def build(edges: np.ndarray, bounds: np.ndarray, stiffness: float) -> Hierarchy:
-    """Hierarchy of meshes with edges (E, 2), i < j, sorted; component c has the points bounds[c:c + 2]."""
-    up_start, up = _rows(edges, bounds[-1]), np.ascontiguousarray(edges[:, 1])
-    levels, all_bounds = [], [bounds]
+@njit()
+def build(edges, count, stiffness):
+    """Hierarchy of a mesh of `count` points with edges (E, 2), i < j, sorted."""
+    up_start, up = _rows(edges, count)
+    levels = []
     while True:
         down_start, down, down_edge = _reversed(up_start, up)
-        parent, coarse_bounds = _aggregates(up_start, up, down_start, down, all_bounds[-1])
+        parent, aggregates = _aggregates(up_start, up, down_start, down)
         coarse_start, coarse_up, edge_parent = _coarse_edges(
-            up_start, up, down_start, down, down_edge, parent, coarse_bounds[-1])
+            up_start, up, down_start, down, down_edge, parent, aggregates)
         levels.append((up_start, up, down_start, down, down_edge, parent, edge_parent))
-        if coarse_bounds[-1] == 0:
-            return _flat(levels, all_bounds, stiffness)
+        if aggregates == 0:
+            return _flat(levels, stiffness)
         up_start, up = coarse_start, coarse_up
-        all_bounds.append(coarse_bounds)
 
 
-def _flat(levels, all_bounds, stiffness) -> Hierarchy:
+@njit()
+def _flat(levels, stiffness):
     """One list of nodes of all levels."""
-    up_start, up, down_start, down, down_edge, parent, edge_parent = zip(*levels, strict=True)
-    node = np.cumsum([0] + [len(part) for part in parent]).tolist()
-    edge = np.cumsum([0] + [len(part) for part in up]).tolist()
-
-    def shifted(parts, firsts):
-        return np.concatenate([
-            part + (part >= 0) * part.dtype.type(first) for part, first in zip(parts, firsts, strict=True)])
-
-    def starts(parts):
-        return np.append(shifted([part[:-1] for part in parts], edge[:-1]), edge[-1])
-
+    bounds, ends = np.zeros(len(levels) + 1, np.int64), np.zeros(len(levels) + 1, np.int64)
+    for level in range(len(levels)):
+        bounds[level + 1] = bounds[level] + len(levels[level][5])
+        ends[level + 1] = ends[level] + len(levels[level][1])
+    nodes, edges = bounds[-1], ends[-1]
+    up_start, down_start = np.empty(nodes + 1, np.int64), np.empty(nodes + 1, np.int64)
+    up, down, down_edge = np.empty(edges, np.int32), np.empty(edges, np.int32), np.empty(edges, np.int32)
+    parent, edge_parent = np.empty(nodes, np.int32), np.empty(edges, np.int32)
+    for level in range(len(levels)):
+        node, edge, coarser, coarser_edge = bounds[level], ends[level], bounds[level + 1], ends[level + 1]
+        ups_start, ups, downs_start, downs, down_edges, parents, edge_parents = levels[level]
+        for i in range(len(parents)):
+            up_start[node + i], down_start[node + i] = edge + ups_start[i], edge + downs_start[i]
+            parent[node + i] = coarser + parents[i] if parents[i] >= 0 else -1
+        for e in range(len(ups)):
+            up[edge + e], down[edge + e] = node + ups[e], node + downs[e]
+            down_edge[edge + e] = edge + down_edges[e]
+            edge_parent[edge + e] = coarser_edge + edge_parents[e] if edge_parents[e] >= 0 else -1
+    up_start[nodes] = down_start[nodes] = edges
     return Hierarchy(
-        np.stack([part + first for part, first in zip(all_bounds, node[:-1], strict=True)]),
-        starts(up_start), shifted(up, node[:-1]), np.arange(edge[-1], dtype=np.int32),
-        starts(down_start), shifted(down, node[:-1]), shifted(down_edge, edge[:-1]),
-        shifted(parent, node[1:]), shifted(edge_parent, edge[1:]), stiffness,
-        np.empty((node[1], 3)), np.empty((edge[-1] - edge[1], SIZE)), np.empty((node[-1], SIZE)))
+        bounds, up_start, up, np.arange(edges).astype(np.int32), down_start, down, down_edge, parent,
+        edge_parent, stiffness, np.empty((bounds[1], 3)), np.empty((edges - ends[1], SIZE)),
+        np.empty((nodes, SIZE)))
 
 
 @njit(error_model="numpy")
-def weigh(hierarchy, c):
-    """Fill the inertias of the edges of component c, and what they sum up to at its nodes, from `lever`."""
+def weigh(hierarchy):
+    """Fill the inertias of the edges, and what they sum up to at the nodes, from `lever`."""
     bounds, up_start, up = hierarchy.bounds, hierarchy.up_start, hierarchy.up
     inertias, incident, edge_parent = hierarchy.inertias, hierarchy.incident, hierarchy.edge_parent
     lever, stiffness, points_edges = hierarchy.lever, hierarchy.stiffness, len(up) - len(inertias)
     softened = _SOFTENING * stiffness
-    for level in range(len(bounds)):
-        first, last = bounds[level, c], bounds[level, c + 1]
-        incident[first:last] = 0.0
-        if level > 0:
-            inertias[up_start[first] - points_edges:up_start[last] - points_edges] = 0.0
-    for i in range(bounds[0, c], bounds[0, c + 1]):
+    incident[:] = 0.0
+    inertias[:] = 0.0
+    for i in range(bounds[1]):
         for e in range(up_start[i], up_start[i + 1]):
             add_at(incident, i, lever, up[e], stiffness, stiffness)
             add_at(incident, up[e], lever, up[e], stiffness, stiffness)
             if edge_parent[e] >= 0:
                 add_at(inertias, edge_parent[e] - points_edges, lever, up[e], softened, softened)
-    for level in range(1, len(bounds)):
-        for i in range(bounds[level, c], bounds[level, c + 1]):
-            for e in range(up_start[i], up_start[i + 1]):
-                for k in range(SIZE):
-                    share = inertias[e - points_edges, k]
-                    incident[i, k] += share
-                    incident[up[e], k] += share
-                    if edge_parent[e] >= 0:
-                        inertias[edge_parent[e] - points_edges, k] += _SOFTENING * share
+    for i in range(bounds[1], bounds[-1]):
+        for e in range(up_start[i], up_start[i + 1]):
+            for k in range(SIZE):
+                share = inertias[e - points_edges, k]
+                incident[i, k] += share
+                incident[up[e], k] += share
+                if edge_parent[e] >= 0:
+                    inertias[edge_parent[e] - points_edges, k] += _SOFTENING * share
 
 
 @njit()
 def _rows(edges, count):
-    start = np.zeros(count + 1, np.int64)
+    """Start (count + 1,) of every node in the list of neighbours with higher numbers, and that list."""
+    start, up = np.zeros(count + 1, np.int64), np.empty(len(edges), np.int32)
     for e in range(len(edges)):
         start[edges[e, 0] + 1] += 1
-    return np.cumsum(start)
+        up[e] = edges[e, 1]
+    return np.cumsum(start), up
 
 
 @njit()
@@ -121,48 +126,44 @@ def _reversed(up_start, up):
 
 
 @njit()
-def _aggregates(up_start, up, down_start, down, bounds):
+def _aggregates(up_start, up, down_start, down):
     """Aggregate (N,) of every node, a node with all its neighbours where these are free, then what is left.
 
     That is the first phase of Vanek, Mandel and Brezina 1996; what is left joins its first neighbour's. A
-    component without edges has no coarser level: -1. Also returns the bounds of components among aggregates.
+    mesh without edges has no coarser level: -1. Also returns how many aggregates there are.
     """
-    parent = np.full(len(up_start) - 1, -1, np.int32)
-    coarse_bounds = np.zeros(len(bounds), bounds.dtype)
+    nodes = len(up_start) - 1
+    parent = np.full(nodes, -1, np.int32)
     count = 0
-    for c in range(len(bounds) - 1):
-        first, last = bounds[c], bounds[c + 1]
-        coarse_bounds[c] = count
-        if up_start[first] == up_start[last]:
+    if len(up) == 0:
+        return parent, count
+    for i in range(nodes):
+        free = parent[i] < 0
+        for e in range(up_start[i], up_start[i + 1]):
+            free = free and parent[up[e]] < 0
+        for e in range(down_start[i], down_start[i + 1]):
+            free = free and parent[down[e]] < 0
+        if not free:
             continue
-        for i in range(first, last):
-            free = parent[i] < 0
-            for e in range(up_start[i], up_start[i + 1]):
-                free = free and parent[up[e]] < 0
+        parent[i] = count
+        for e in range(up_start[i], up_start[i + 1]):
+            parent[up[e]] = count
+        for e in range(down_start[i], down_start[i + 1]):
+            parent[down[e]] = count
+        count += 1
+    for i in range(nodes):
+        if parent[i] < 0:
+            # An aggregate of the first phase: what joined in this one is told by its sign.
             for e in range(down_start[i], down_start[i + 1]):
-                free = free and parent[down[e]] < 0
-            if not free:
-                continue
-            parent[i] = count
+                if parent[i] == -1 and parent[down[e]] >= 0:
+                    parent[i] = -2 - parent[down[e]]
             for e in range(up_start[i], up_start[i + 1]):
-                parent[up[e]] = count
-            for e in range(down_start[i], down_start[i + 1]):
-                parent[down[e]] = count
-            count += 1
-        for i in range(first, last):
-            if parent[i] < 0:
-                # An aggregate of the first phase: what joined in this one is told by its sign.
-                for e in range(down_start[i], down_start[i + 1]):
-                    if parent[i] == -1 and parent[down[e]] >= 0:
-                        parent[i] = -2 - parent[down[e]]
-                for e in range(up_start[i], up_start[i + 1]):
-                    if parent[i] == -1 and parent[up[e]] >= 0:
-                        parent[i] = -2 - parent[up[e]]
-        for i in range(first, last):
-            if parent[i] < -1:
-                parent[i] = -2 - parent[i]
-    coarse_bounds[-1] = count
-    return parent, coarse_bounds
+                if parent[i] == -1 and parent[up[e]] >= 0:
+                    parent[i] = -2 - parent[up[e]]
+    for i in range(nodes):
+        if parent[i] < -1:
+            parent[i] = -2 - parent[i]
+    return parent, count
 
 
 @njit()

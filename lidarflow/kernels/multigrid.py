@@ -23,40 +23,30 @@ Room = namedtuple("Room", (
     "held", "inverse", "loads", "twists", "seen", "before", "direction", "product", "step"))
 
 
-def room_for(hierarchy) -> Room:
+@njit()
+def room_for(hierarchy):
     """Arrays that the solver works in."""
     nodes, points = len(hierarchy.parent), len(hierarchy.lever)
-    sizes = ((nodes, inertia.SIZE),) * 2 + ((nodes, 6),) * 2 + ((points, 6),) * 5
-    return Room(*(np.empty(size) for size in sizes))
+    return Room(
+        np.empty((nodes, inertia.SIZE)), np.empty((nodes, inertia.SIZE)), np.empty((nodes, 6)),
+        np.empty((nodes, 6)), np.empty((points, 6)), np.empty((points, 6)), np.empty((points, 6)),
+        np.empty((points, 6)), np.empty((points, 6)))
 
 
 @njit(error_model="numpy")
-def levels_of(hierarchy, c):
-    """How many levels component c has."""
-    bounds = hierarchy.bounds
-    count = 1
-    while count < len(bounds) and bounds[count, c] < bounds[count, c + 1]:
-        count += 1
-    return count
-
-
-@njit(error_model="numpy")
-def hold(hierarchy, room, c, places, active, data_weight, tie_weight, damping):
-    """Fill `held` and `inverse` of component c, from the matches and ties that are `active` (M,)."""
+def hold(hierarchy, room, places, active, data_weight, tie_weight, damping):
+    """Fill `held` and `inverse`, from the matches and ties that are `active` (M,)."""
     bounds, parent, incident = hierarchy.bounds, hierarchy.parent, hierarchy.incident
     held, inverse = room.held, room.inverse
-    levels = levels_of(hierarchy, c)
-    for level in range(levels):
-        held[bounds[level, c]:bounds[level, c + 1]] = 0.0
-    for i in range(bounds[0, c], bounds[0, c + 1]):
+    held[:] = 0.0
+    for i in range(bounds[1]):
         rotational = damping + tie_weight * (active[i] >> 1)
         inertia.add_at(held, i, places, i, rotational + data_weight * (active[i] & 1), rotational)
-    for level in range(levels):
-        for i in range(bounds[level, c], bounds[level, c + 1]):
-            inertia.invert(incident, held, inverse, i)
-            if level + 1 < levels:
-                for k in range(inertia.SIZE):
-                    held[parent[i], k] += held[i, k]
+    for i in range(bounds[-1]):
+        inertia.invert(incident, held, inverse, i)
+        if i < bounds[-2]:
+            for k in range(inertia.SIZE):
+                held[parent[i], k] += held[i, k]
 
 
 @njit(error_model="numpy")
@@ -109,12 +99,12 @@ def _loaded(loads, i, s, a, b, c, d, e, f):
 # The arrays are taken out of their tuples in each of the sweeps: inner calls with them would copy it all.
 
 @njit(error_model="numpy")
-def _points_down(hierarchy, room, first, last):
+def _points_down(hierarchy, room):
     """A Gauss-Seidel sweep from rest over points, in order; what is left becomes the next level's load."""
     up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
     lever, parent, s = hierarchy.lever, hierarchy.parent, hierarchy.stiffness
     inverse, loads, twists, seen = room.inverse, room.loads, room.twists, room.seen
-    for i in range(first, last):
+    for i in range(len(lever)):
         a, b, c, d, e, f = _sum(down, down_start[i], down_start[i + 1], twists)
         a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
         a, b, c, d, e, f = _loaded(loads, i, s, a, b, c, d, e, f)
@@ -122,7 +112,7 @@ def _points_down(hierarchy, room, first, last):
         _set(twists, i, a, b, c, d, e, f)
         a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
         _set(seen, i, a, b, c, d, e, f)
-    for i in range(first, last):
+    for i in range(len(lever)):
         # Where point i was solved, the later ones were at rest: their pull is what is left.
         a, b, c, d, e, f = _sum(up, up_start[i], up_start[i + 1], seen)
         if parent[i] >= 0:
@@ -130,15 +120,15 @@ def _points_down(hierarchy, room, first, last):
 
 
 @njit(error_model="numpy")
-def _points_up(hierarchy, room, first, last):
+def _points_up(hierarchy, room):
     """Add the coarser level's twists to those of points, then a Gauss-Seidel sweep in reversed order."""
     up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
     lever, parent, s = hierarchy.lever, hierarchy.parent, hierarchy.stiffness
     inverse, loads, twists, seen, before = room.inverse, room.loads, room.twists, room.seen, room.before
-    for i in range(first, last):
+    for i in range(len(lever)):
         for k in range(6):
             twists[i, k] += twists[parent[i], k]
-    for i in range(last - 1, first - 1, -1):
+    for i in range(len(lever) - 1, -1, -1):
         a, b, c, d, e, f = _sum(down, down_start[i], down_start[i + 1], twists)
         _set(before, i, a, b, c, d, e, f)
         a, b, c, d, e, f = _see(lever, i, a, b, c, d, e, f)
@@ -204,25 +194,22 @@ def _nodes_up(hierarchy, room, first, last):
 
 
 @njit(error_model="numpy")
-def cycle(hierarchy, room, c):
-    """One V-cycle: about the `twists` that the `loads` of the first level make of component c."""
+def cycle(hierarchy, room):
+    """One V-cycle: about the `twists` that the `loads` of the first level make."""
     bounds = hierarchy.bounds
-    levels = levels_of(hierarchy, c)
-    for level in range(levels):
-        if level + 1 < levels:
-            room.loads[bounds[level + 1, c]:bounds[level + 1, c + 1]] = 0.0
-        if level == 0:
-            _points_down(hierarchy, room, bounds[0, c], bounds[0, c + 1])
-        else:
-            _nodes_down(hierarchy, room, bounds[level, c], bounds[level, c + 1])
+    levels = len(bounds) - 1
+    room.loads[bounds[1]:] = 0.0
+    _points_down(hierarchy, room)
+    for level in range(1, levels):
+        _nodes_down(hierarchy, room, bounds[level], bounds[level + 1])
     for level in range(levels - 2, 0, -1):
-        _nodes_up(hierarchy, room, bounds[level, c], bounds[level, c + 1])
+        _nodes_up(hierarchy, room, bounds[level], bounds[level + 1])
     if levels > 1:
-        _points_up(hierarchy, room, bounds[0, c], bounds[0, c + 1])
+        _points_up(hierarchy, room)
 
 
 @njit(error_model="numpy")
-def _turn(hierarchy, room, first, last, share):
+def _turn(hierarchy, room, share):
     """The next direction, the cycle's twists and a share of the last one, and its product with the equations.
 
     A cycle leaves unbalanced what earlier neighbours have moved since a point was last solved: its product is
@@ -232,7 +219,7 @@ def _turn(hierarchy, room, first, last, share):
     loads, twists, before = room.loads, room.twists, room.before
     direction, product = room.direction, room.product
     total = 0.0
-    for i in range(first, last):
+    for i in range(len(lever)):
         a, b, c, d, e, f = loads[i, 0], loads[i, 1], loads[i, 2], loads[i, 3], loads[i, 4], loads[i, 5]
         if down_start[i] < down_start[i + 1]:
             g, h, k, m, n, o = _sum(down, down_start[i], down_start[i + 1], twists)
@@ -254,48 +241,47 @@ def _turn(hierarchy, room, first, last, share):
 
 
 @njit(error_model="numpy")
-def _dot(a, b, first, last):
+def _dot(a, b, count):
     total = 0.0
-    for i in range(first, last):
+    for i in range(count):
         total += (a[i, 0] * b[i, 0] + a[i, 1] * b[i, 1] + a[i, 2] * b[i, 2]
                   + a[i, 3] * b[i, 3] + a[i, 4] * b[i, 4] + a[i, 5] * b[i, 5])
     return total
 
 
 @njit(error_model="numpy")
-def _add_all(rows, scale, others, first, last):
-    for i in range(first, last):
+def _add_all(rows, scale, others, count):
+    for i in range(count):
         for k in range(6):
             rows[i, k] += scale * others[i, k]
 
 
 @njit(error_model="numpy")
-def solve(hierarchy, room, c, gradient, tolerance, little, enough, most):
-    """Fill `step` (M, 6) of component c with the twists that minimise the quadratic model of the energy.
+def solve(hierarchy, room, gradient, tolerance, little, enough, most):
+    """Fill `step` (M, 6) with the twists that minimise the quadratic model of the energy.
 
     Conjugate gradients, until a cycle foresees less than `tolerance` of what all iterations have gained, or
     `little`, or `most` iterations. That last cycle's twists are part of the step as they are. Where less than
     `enough` seems to be there to gain from the start, no step is made. Returns how many iterations were made,
     each with a cycle and a product, or -1 for no step.
     """
-    first, last = hierarchy.bounds[0, c], hierarchy.bounds[0, c + 1]
     loads, step, direction, product = room.loads, room.step, room.direction, room.product
-    for i in range(first, last):
+    for i in range(len(step)):
         for k in range(6):
             loads[i, k] = -gradient[i, k]
             step[i, k] = 0.0
     gain, last_square = 0.0, 1.0
     for iteration in range(most):
-        cycle(hierarchy, room, c)
-        square = _dot(loads, room.twists, first, last)
+        cycle(hierarchy, room)
+        square = _dot(loads, room.twists, len(step))
         if iteration == 0 and not 0.5 * square >= max(enough, _NOTHING):
             return -1
         if 0.5 * square <= max(tolerance * gain, little):
-            _add_all(step, 1.0, room.twists, first, last)
+            _add_all(step, 1.0, room.twists, len(step))
             return iteration
-        length = square / _turn(hierarchy, room, first, last, square / last_square if iteration else 0.0)
-        _add_all(step, length, direction, first, last)
-        _add_all(loads, -length, product, first, last)
+        length = square / _turn(hierarchy, room, square / last_square if iteration else 0.0)
+        _add_all(step, length, direction, len(step))
+        _add_all(loads, -length, product, len(step))
         last_square = square
         gain += 0.5 * length * square
     return most

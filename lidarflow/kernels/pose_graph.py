@@ -7,26 +7,44 @@ what it does there. A gradient is a wrench (6,): torque about the origin, then f
 
 from collections import namedtuple
 
-import numba
 import numpy as np
 
 from lidarflow.kernels import twist_errors
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.rotations import cross, from_matrix, stepped, to_matrix, turned
 
-# points (M, 3); edges (E, 2) i < j, sorted by component; matched (M,) bool, targets (M, 3); tied (M,) bool,
-# ties (M, 7) rows as of variables; at_point: eq. 10 seen at the point. Then the weights, and the squares
-# that matches and ties are truncated at.
-Factors = namedtuple("Factors", (
-    "points", "edges", "matched", "targets", "tied", "ties", "at_point", "data_weight", "smoothness_weight",
-    "tie_weight", "truncation_sq", "tie_truncation_sq"))
+# A whole problem: points (N, 3); match (N,) is which of the targets (K, 3) a variable has, group (N,) which
+# of the motions (G, 4, 4) it is tied to, -1 = none.
+Graph = namedtuple("Graph", ("points", "match", "targets", "group", "group_motions"))
+# at_point: eq. 10 seen at the point. Then what terms count, and the squares that they are truncated at.
+Weights = namedtuple("Weights", (
+    "at_point", "data", "smoothness", "tie", "truncation_sq", "tie_truncation_sq"))
+# A part of it: points (M, 3); edges (E, 2) i < j, sorted; matched (M,) bool, targets (M, 3); tied (M,) bool,
+# ties (M, 7) rows as of variables.
+Factors = namedtuple("Factors", ("points", "edges", "matched", "targets", "tied", "ties", "weights"))
 
 
-@njit(parallel=True)
+@njit()
+def factors_of(graph, weights, rows, edges):
+    """Factors of the variables `rows` (M,) of a graph, with edges (E, 2) between their places among these."""
+    points, targets = np.empty((len(rows), 3)), np.zeros((len(rows), 3))
+    matched, tied = np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
+    for i in range(len(rows)):
+        match = graph.match[rows[i]]
+        matched[i], tied[i] = match >= 0, graph.group[rows[i]] >= 0
+        for k in range(3):
+            points[i, k] = graph.points[rows[i], k]
+            if match >= 0:
+                targets[i, k] = graph.targets[match, k]
+    ties = variables_of(graph.group_motions, graph.group[rows], points)
+    return Factors(points, edges, matched, targets, tied, ties, weights)
+
+
+@njit()
 def variables_of(motions, rows, points):
     """Variables (M, 7) of the motions in `rows` (M,) of (N, 4, 4), at points (M, 3); zeros for row -1."""
     variables = np.zeros((len(points), 7))
-    for i in numba.prange(len(points)):
+    for i in range(len(points)):
         if rows[i] >= 0:
             motion = motions[rows[i]]
             x, y, z, w = from_matrix(motion)
@@ -37,10 +55,10 @@ def variables_of(motions, rows, points):
     return variables
 
 
-@njit(parallel=True)
+@njit()
 def motions_of(variables, points, rows, motions):
     """Write the motions of variables (M, 7) at points (M, 3) to `rows` (M,) of `motions` (N, 4, 4)."""
-    for i in numba.prange(len(points)):
+    for i in range(len(points)):
         motion = motions[rows[i]]
         to_matrix(variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3], motion)
         for k in range(3):
@@ -49,18 +67,25 @@ def motions_of(variables, points, rows, motions):
 
 
 @njit()
+def shift(variables, factors, by, sign):
+    """Add `sign` times a vector `by` (3,) to the positions of variables, targets and ties."""
+    for i in range(len(variables)):
+        for k in range(3):
+            variables[i, 4 + k] += sign * by[k]
+            factors.targets[i, k] += sign * by[k]
+            factors.ties[i, 4 + k] += sign * by[k]
+
+
+@njit()
 def edges_between(edges, place, count):
-    """The edges (E, 2) between what has a place (M,), not -1, as sorted pairs of `count` places."""
+    """Edges (E, 2) as sorted pairs of the `count` places (N,) of what they join."""
     first = np.zeros(count + 1, np.int64)
     for e in range(len(edges)):
-        if place[edges[e, 0]] >= 0:
-            first[place[edges[e, 0]] + 1] += 1
+        first[place[edges[e, 0]] + 1] += 1
     first = np.cumsum(first)
     end, found = first[:-1].copy(), np.empty((first[-1], 2), place.dtype)
     for e in range(len(edges)):
         i, j = place[edges[e, 0]], place[edges[e, 1]]
-        if i < 0:
-            continue
         slot = end[i]
         while slot > first[i] and found[slot - 1, 1] > j:
             found[slot, 0], found[slot, 1] = i, found[slot - 1, 1]
@@ -71,18 +96,17 @@ def edges_between(edges, place, count):
 
 
 @njit(error_model="numpy")
-def smoothness(factors, variables, nodes, edges, block, wrenches):
-    """Energy of the edges from edges[0] to edges[1] (eq. 10), which are all those of the variables
-    from nodes[0] to nodes[1], whose gradient is written to `wrenches` (M, 6)."""
-    pairs, weight = factors.edges, factors.smoothness_weight
-    wrenches[nodes[0]:nodes[1]] = 0.0
+def smoothness(factors, variables, block, wrenches):
+    """Energy of the edges (eq. 10), whose gradient is written to `wrenches` (M, 6)."""
+    pairs, at_point, weight = factors.edges, factors.weights.at_point, factors.weights.smoothness
+    wrenches[:] = 0.0
     total = 0.0
-    for start in range(edges[0], edges[1], twist_errors.WIDTH):
-        count = min(twist_errors.WIDTH, edges[1] - start)
+    for start in range(0, len(pairs), twist_errors.WIDTH):
+        count = min(twist_errors.WIDTH, len(pairs) - start)
         for k in range(count):
             i, j = pairs[start + k, 0], pairs[start + k, 1]
             twist_errors.put_poses(block, k, variables, i, variables, j)
-            twist_errors.put_points(block, k, factors.points, i, j, factors.at_point)
+            twist_errors.put_points(block, k, factors.points, i, j, at_point)
         twist_errors.evaluate(block)
         for k in range(count):
             total += twist_errors.square(block, k)
@@ -92,23 +116,23 @@ def smoothness(factors, variables, nodes, edges, block, wrenches):
 
 
 @njit(error_model="numpy")
-def evidence(factors, variables, nodes, robust, block, wrenches, active):
-    """Energy of the matches and ties of the variables from nodes[0] to nodes[1]; adds its gradient.
+def evidence(factors, variables, robust, block, wrenches, active):
+    """Energy of the matches and ties; adds its gradient to `wrenches` (M, 6).
 
     Fills `active` (M,): 1 for a match that counts, 2 for a tie. With `robust` those beyond the truncation
     do not.
     """
-    active[nodes[0]:nodes[1]] = 0
-    return (_matches(factors, variables, nodes, robust, wrenches, active)
-            + _ties(factors, variables, nodes, robust, block, wrenches, active))
+    active[:] = 0
+    return (_matches(factors, variables, robust, wrenches, active)
+            + _ties(factors, variables, robust, block, wrenches, active))
 
 
 @njit(error_model="numpy")
-def _matches(factors, variables, nodes, robust, wrenches, active):
+def _matches(factors, variables, robust, wrenches, active):
     matched, targets, weight, most = (
-        factors.matched, factors.targets, factors.data_weight, factors.truncation_sq)
+        factors.matched, factors.targets, factors.weights.data, factors.weights.truncation_sq)
     total = 0.0
-    for i in range(nodes[0], nodes[1]):
+    for i in range(len(variables)):
         if not matched[i]:
             continue
         x, y, z = variables[i, 4], variables[i, 5], variables[i, 6]
@@ -130,26 +154,26 @@ def _matches(factors, variables, nodes, robust, wrenches, active):
 
 
 @njit(error_model="numpy")
-def near_matches(factors, variables, nodes):
-    """How many matches of the variables from nodes[0] to nodes[1] are within the truncation, and how many
-    there are."""
-    matched, targets = factors.matched, factors.targets
+def near_matches(factors, variables):
+    """How many matches of the variables are within the truncation, and how many there are."""
+    matched, targets, most = factors.matched, factors.targets, factors.weights.truncation_sq
     near = count = 0
-    for i in range(nodes[0], nodes[1]):
+    for i in range(len(variables)):
         x, y = variables[i, 4] - targets[i, 0], variables[i, 5] - targets[i, 1]
         z = variables[i, 6] - targets[i, 2]
         count += matched[i]
-        near += matched[i] and x * x + y * y + z * z <= factors.truncation_sq
+        near += matched[i] and x * x + y * y + z * z <= most
     return near, count
 
 
 @njit(error_model="numpy")
-def _ties(factors, variables, nodes, robust, block, wrenches, active):
-    tied, ties, weight, most = factors.tied, factors.ties, factors.tie_weight, factors.tie_truncation_sq
+def _ties(factors, variables, robust, block, wrenches, active):
+    tied, ties, weight, most = (
+        factors.tied, factors.ties, factors.weights.tie, factors.weights.tie_truncation_sq)
     total = 0.0
     twist_errors.put_together(block)
-    for start in range(nodes[0], nodes[1], twist_errors.WIDTH):
-        count = min(twist_errors.WIDTH, nodes[1] - start)
+    for start in range(0, len(tied), twist_errors.WIDTH):
+        count = min(twist_errors.WIDTH, len(tied) - start)
         some = False
         for k in range(count):
             twist_errors.put_poses(block, k, ties, start + k, variables, start + k)
@@ -171,9 +195,9 @@ def _ties(factors, variables, nodes, robust, block, wrenches, active):
 
 
 @njit(error_model="numpy")
-def step(variables, nodes, twists, moved):
-    """Write the variables nodes[0] .. nodes[1], each moved by its twist of `twists` (M, 6), to `moved`."""
-    for i in range(nodes[0], nodes[1]):
+def step(variables, twists, moved):
+    """Write the variables, each moved by its twist of `twists` (M, 6), to `moved`."""
+    for i in range(len(variables)):
         ox, oy, oz = twists[i, 0], twists[i, 1], twists[i, 2]
         ux, uy, uz = cross(ox, oy, oz, variables[i, 4], variables[i, 5], variables[i, 6])
         moved[i, 0], moved[i, 1], moved[i, 2], moved[i, 3] = stepped(
@@ -184,13 +208,13 @@ def step(variables, nodes, twists, moved):
 
 
 @njit(error_model="numpy")
-def place_levers(factors, variables, nodes, levers):
+def place_levers(factors, variables, levers):
     """Put `levers` (M, 3) where the twist between a variable and an earlier neighbour is seen.
 
     That is at the point, or at what the sensor's origin becomes when it moves with the point.
     """
-    points, at_point = factors.points, factors.at_point
-    for i in range(nodes[0], nodes[1]):
+    points, at_point = factors.points, factors.weights.at_point
+    for i in range(len(variables)):
         x = y = z = 0.0
         if not at_point:
             x, y, z = turned(variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3],

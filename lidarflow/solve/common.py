@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarflow import pose
-from lidarflow.config import SolverConfig
 from lidarflow.errors import SolveError
 from lidarflow.types import FlowProblem, SolveStats
 
@@ -27,36 +25,30 @@ class Step:
 def require_finite(problem: FlowProblem) -> None:
     """Raise SolveError for a problem with numbers that are not finite."""
     for name in ("points", "initial", "match_target", "group_motions"):
-        wrong = ~np.isfinite(getattr(problem, name))
-        if wrong.any():
+        finite = np.isfinite(getattr(problem, name))
+        if not finite.all():
             raise SolveError(
-                f"FlowProblem.{name}: expected finite numbers, found {int(wrong.sum())} that are not; "
+                f"FlowProblem.{name}: expected finite numbers, found {int((~finite).sum())} that are not; "
                 "leave out what has none")
 
 
 def matches_per_component(problem: FlowProblem, kept: np.ndarray | None = None) -> np.ndarray:
     """Number (C,) of the matches, or of the `kept` (K,) ones, in every component."""
-    count = int(problem.component.max()) + 1 if len(problem.component) else 0
+    count = int(problem.component.max(initial=-1)) + 1
     index = problem.match_index if kept is None else problem.match_index[kept]
     return np.bincount(problem.component[index], minlength=count)
 
 
 def concluded(
-    solver: str, problem: FlowProblem, found: np.ndarray, tried: np.ndarray, plain: list[Step],
-    robust: list[Step], config: SolverConfig, min_matches: int,
-) -> tuple[np.ndarray, np.ndarray, SolveStats]:
-    """What a solver returns, of the motions it `found` (M, 4, 4) for the components `tried` (C,).
+    solver: str, problem: FlowProblem, accepted: np.ndarray, kept: np.ndarray, plain: list[Step],
+    robust: list[Step],
+) -> tuple[np.ndarray, SolveStats]:
+    """Which variables are solved (M,), and what the solver did, of the components `accepted` (C,).
 
-    Components that keep fewer than `min_matches` matches within the truncation have no unique solution:
-    they get their start value back.
+    kept (C,) is how many matches each of them keeps within the truncation.
     """
-    index = problem.match_index
-    off_m = pose.apply(found[index], problem.points[index]) - problem.match_target
-    kept = matches_per_component(problem, (off_m**2).sum(axis=1) <= config.truncation_m**2)
-    accepted = tried & (kept >= min_matches)
     solved = accepted[problem.component]
-    motions = np.where(solved[:, None, None], found, problem.initial)
-    present = np.bincount(problem.component, minlength=len(tried)) > 0
+    present = np.bincount(problem.component, minlength=len(accepted)) > 0
     stats = SolveStats(
         solver=solver,
         variables=len(problem.points),
@@ -73,4 +65,4 @@ def concluded(
         inliers=int(kept[accepted].sum()),
         stopped=dict(sorted(Counter(s.stopped for s in plain + robust).items())),
     )
-    return motions, solved, stats
+    return solved, stats

@@ -30,7 +30,8 @@ def solve(
     """
     common.require_finite(problem)
     found = problem.initial.copy()
-    tried = common.matches_per_component(problem) >= max(min_matches, 1)
+    min_matches = max(min_matches, 1)
+    tried = common.matches_per_component(problem) >= min_matches
     plain, robust = [], []
     for part in _components(problem):
         if not tried[problem.component[part.rows[0]]]:
@@ -38,7 +39,12 @@ def solve(
         found[part.rows], plain_step, robust_step = _solve_component(part, config)
         plain.append(plain_step)
         robust.append(robust_step)
-    return common.concluded("gtsam", problem, found, tried, plain, robust, config, min_matches)
+    index = problem.match_index
+    off_m = pose.apply(found[index], problem.points[index]) - problem.match_target
+    kept = common.matches_per_component(problem, (off_m**2).sum(axis=1) <= config.truncation_m**2)
+    solved, stats = common.concluded(
+        "gtsam", problem, tried & (kept >= min_matches), kept, plain, robust)
+    return np.where(solved[:, None, None], found, problem.initial), solved, stats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
