@@ -12,7 +12,7 @@ from collections import namedtuple
 
 import numpy as np
 
-from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.compiled import FUSED, njit
 from lidarflow.kernels.inertia import SIZE, add_at
 
 _SOFTENING = 0.5    # share of the sum of edges that counts for the coarser one
@@ -72,7 +72,7 @@ def _flat(levels, stiffness):
         np.empty((nodes, SIZE)))
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def weigh(hierarchy):
     """Fill the inertias of the edges, and what they sum up to at the nodes, from `lever`."""
     bounds, up_start, up = hierarchy.bounds, hierarchy.up_start, hierarchy.up

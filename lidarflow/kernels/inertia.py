@@ -7,13 +7,13 @@ of the normal equations. Blocks of the points that move as one are their sum.
 """
 
 
-from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.compiled import FUSED, njit
 from lidarflow.kernels.rotations import cross
 
 SIZE = 10
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def add_at(inertias, i, places, j, mass, rotational):
     """Add to the i-th inertia a mass at the j-th place, and what resists rotation in any direction."""
     x, y, z = places[j, 0], places[j, 1], places[j, 2]
@@ -29,7 +29,7 @@ def add_at(inertias, i, places, j, mass, rotational):
     inertias[i, 9] += rotational + mass * (x * x + y * y)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def wrench(inertias, i, ox, oy, oz, vx, vy, vz):
     """Torque and force that the i-th inertia makes of a twist."""
     m, hx, hy, hz = inertias[i, 0], inertias[i, 1], inertias[i, 2], inertias[i, 3]
@@ -41,7 +41,7 @@ def wrench(inertias, i, ox, oy, oz, vx, vy, vz):
             m * vx + fx, m * vy + fy, m * vz + fz)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def invert(first, second, inverses, i):
     """Write what `twist` needs to undo the sum of the i-th of two kinds of inertias to the i-th inverse.
 
@@ -65,7 +65,7 @@ def invert(first, second, inverses, i):
     inverses[i, 9] = scale * (a * d - b * b)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def twist(inverses, i, tx, ty, tz, fx, fy, fz):
     """The twist that the i-th inverse makes of a torque and a force."""
     by_m, x, y, z = inverses[i, 0], inverses[i, 1], inverses[i, 2], inverses[i, 3]

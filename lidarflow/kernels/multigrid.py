@@ -10,7 +10,7 @@ from collections import namedtuple
 import numpy as np
 
 from lidarflow.kernels import inertia
-from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.compiled import FUSED, njit
 from lidarflow.kernels.rotations import cross
 
 _NOTHING = 1e-300    # less is not worth a step, whatever is asked for
@@ -33,7 +33,7 @@ def room_for(hierarchy):
         np.empty((points, 6)), np.empty((points, 6)))
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def hold(hierarchy, room, places, active, data_weight, tie_weight, damping):
     """Fill `held` and `inverse`, from the matches and ties that are `active` (M,)."""
     bounds, parent, incident = hierarchy.bounds, hierarchy.parent, hierarchy.incident
@@ -49,7 +49,7 @@ def hold(hierarchy, room, places, active, data_weight, tie_weight, damping):
                 held[parent[i], k] += held[i, k]
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _see(lever, i, ox, oy, oz, vx, vy, vz):
     """What a unit inertia at a point's lever makes of a twist: a wrench about the origin."""
     x, y, z = lever[i, 0], lever[i, 1], lever[i, 2]
@@ -59,7 +59,7 @@ def _see(lever, i, ox, oy, oz, vx, vy, vz):
     return ox + tx, oy + ty, oz + tz, ux, uy, uz
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _sum(neighbours, start, end, rows):
     """Sum of the rows (6,) of some neighbours."""
     a = b = c = d = e = f = 0.0
@@ -74,12 +74,12 @@ def _sum(neighbours, start, end, rows):
     return a, b, c, d, e, f
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _set(rows, i, a, b, c, d, e, f):
     rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4], rows[i, 5] = a, b, c, d, e, f
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _add(rows, i, a, b, c, d, e, f):
     rows[i, 0] += a
     rows[i, 1] += b
@@ -89,7 +89,7 @@ def _add(rows, i, a, b, c, d, e, f):
     rows[i, 5] += f
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _loaded(loads, i, s, a, b, c, d, e, f):
     """The load of a node and what its neighbours add, times s."""
     return (loads[i, 0] + s * a, loads[i, 1] + s * b, loads[i, 2] + s * c,
@@ -98,7 +98,7 @@ def _loaded(loads, i, s, a, b, c, d, e, f):
 
 # The arrays are taken out of their tuples in each of the sweeps: inner calls with them would copy it all.
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _points_down(hierarchy, room):
     """A Gauss-Seidel sweep from rest over points, in order; what is left becomes the next level's load."""
     up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
@@ -119,7 +119,7 @@ def _points_down(hierarchy, room):
             _add(loads, parent[i], s * a, s * b, s * c, s * d, s * e, s * f)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _points_up(hierarchy, room):
     """Add the coarser level's twists to those of points, then a Gauss-Seidel sweep in reversed order."""
     up_start, up, down_start, down = hierarchy.up_start, hierarchy.up, hierarchy.down_start, hierarchy.down
@@ -140,7 +140,7 @@ def _points_up(hierarchy, room):
         _set(seen, i, a, b, c, d, e, f)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _pull(inertias, twists, edges, first_edge, neighbours, start, end):
     """What the twists of some neighbours of a coarse node add to its load."""
     a = b = c = d = e = f = 0.0
@@ -153,7 +153,7 @@ def _pull(inertias, twists, edges, first_edge, neighbours, start, end):
     return a, b, c, d, e, f
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _nodes_down(hierarchy, room, first, last):
     """As `_points_down`, for the nodes of a coarser level."""
     up_start, up, up_edge = hierarchy.up_start, hierarchy.up, hierarchy.up_edge
@@ -173,7 +173,7 @@ def _nodes_down(hierarchy, room, first, last):
             _add(loads, parent[i], a, b, c, d, e, f)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _nodes_up(hierarchy, room, first, last):
     """As `_points_up`, for the nodes of a coarser level."""
     up_start, up, up_edge = hierarchy.up_start, hierarchy.up, hierarchy.up_edge
@@ -193,7 +193,7 @@ def _nodes_up(hierarchy, room, first, last):
         _set(twists, i, a, b, c, d, e, f)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def cycle(hierarchy, room):
     """One V-cycle: about the `twists` that the `loads` of the first level make."""
     bounds = hierarchy.bounds
@@ -208,7 +208,7 @@ def cycle(hierarchy, room):
         _points_up(hierarchy, room)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _turn(hierarchy, room, share):
     """The next direction, the cycle's twists and a share of the last one, and its product with the equations.
 
@@ -240,7 +240,7 @@ def _turn(hierarchy, room, share):
     return total
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _dot(a, b, count):
     total = 0.0
     for i in range(count):
@@ -249,14 +249,14 @@ def _dot(a, b, count):
     return total
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _add_all(rows, scale, others, count):
     for i in range(count):
         for k in range(6):
             rows[i, k] += scale * others[i, k]
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def solve(hierarchy, room, gradient, tolerance, little, enough, most):
     """Fill `step` (M, 6) with the twists that minimise the quadratic model of the energy.
 

@@ -10,7 +10,7 @@ from collections import namedtuple
 import numpy as np
 
 from lidarflow.kernels import twist_errors
-from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.compiled import FUSED, njit
 from lidarflow.kernels.rotations import cross, from_matrix, stepped, to_matrix, turned
 
 # A whole problem: points (N, 3); match (N,) is which of the targets (K, 3) a variable has, group (N,) which
@@ -95,7 +95,7 @@ def edges_between(edges, place, count):
     return found
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def smoothness(factors, variables, block, wrenches):
     """Energy of the edges (eq. 10), whose gradient is written to `wrenches` (M, 6)."""
     pairs, at_point, weight = factors.edges, factors.weights.at_point, factors.weights.smoothness
@@ -115,7 +115,7 @@ def smoothness(factors, variables, block, wrenches):
     return 0.5 * weight * total
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def evidence(factors, variables, robust, block, wrenches, active):
     """Energy of the matches and ties; adds its gradient to `wrenches` (M, 6).
 
@@ -127,7 +127,7 @@ def evidence(factors, variables, robust, block, wrenches, active):
             + _ties(factors, variables, robust, block, wrenches, active))
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _matches(factors, variables, robust, wrenches, active):
     matched, targets, weight, most = (
         factors.matched, factors.targets, factors.weights.data, factors.weights.truncation_sq)
@@ -153,7 +153,7 @@ def _matches(factors, variables, robust, wrenches, active):
     return 0.5 * weight * total
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def near_matches(factors, variables):
     """How many matches of the variables are within the truncation, and how many there are."""
     matched, targets, most = factors.matched, factors.targets, factors.weights.truncation_sq
@@ -166,7 +166,7 @@ def near_matches(factors, variables):
     return near, count
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _ties(factors, variables, robust, block, wrenches, active):
     tied, ties, weight, most = (
         factors.tied, factors.ties, factors.weights.tie, factors.weights.tie_truncation_sq)
@@ -194,7 +194,7 @@ def _ties(factors, variables, robust, block, wrenches, active):
     return 0.5 * weight * total
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def step(variables, twists, moved):
     """Write the variables, each moved by its twist of `twists` (M, 6), to `moved`."""
     for i in range(len(variables)):
@@ -207,7 +207,7 @@ def step(variables, twists, moved):
         moved[i, 6] = variables[i, 6] + uz + twists[i, 5]
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def place_levers(factors, variables, levers):
     """Put `levers` (M, 3) where the twist between a variable and an earlier neighbour is seen.
 

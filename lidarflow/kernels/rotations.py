@@ -2,17 +2,17 @@
 
 import math
 
-from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.compiled import FUSED, njit
 
 SERIES_BELOW = 0.01    # squared sine of half an angle, below which the series are exact to rounding
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def cross(ax, ay, az, bx, by, bz):
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def turned(qx, qy, qz, qw, x, y, z):
     """The vector x, y, z turned by a quaternion."""
     tx, ty, tz = cross(qx, qy, qz, x, y, z)
@@ -21,7 +21,7 @@ def turned(qx, qy, qz, qw, x, y, z):
     return x + qw * tx + cx, y + qw * ty + cy, z + qw * tz + cz
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def between(ax, ay, az, aw, bx, by, bz, bw):
     """The quaternion a⁻¹ b, with w ≥ 0."""
     x = aw * bx - ax * bw - (ay * bz - az * by)
@@ -33,7 +33,7 @@ def between(ax, ay, az, aw, bx, by, bz, bw):
     return x, y, z, w
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def logarithm(x, y, z, w):
     """Rotation vector ω of a quaternion with w ≥ 0, and c and dc/d|ω|² of the inverse left Jacobian.
 
@@ -52,7 +52,7 @@ def logarithm(x, y, z, w):
     return scale * x, scale * y, scale * z, c, slope
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def logarithm_series(x, y, z):
     """`logarithm` of a quaternion whose squared sine x² + y² + z² is below SERIES_BELOW."""
     s = x * x + y * y + z * z
@@ -65,7 +65,7 @@ def logarithm_series(x, y, z):
     return scale * x, scale * y, scale * z, c, slope
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def inverse_jacobian(ox, oy, oz, c, sign, x, y, z):
     """J⁻¹(ω) (sign 1) or its transpose (sign −1), the inverse right Jacobian, times a vector."""
     ax, ay, az = cross(ox, oy, oz, x, y, z)
@@ -74,7 +74,7 @@ def inverse_jacobian(ox, oy, oz, c, sign, x, y, z):
     return x - half * ax + c * bx, y - half * ay + c * by, z - half * az + c * bz
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def stepped(qx, qy, qz, qw, ox, oy, oz):
     """The unit quaternion q, then a turn by about the rotation vector ω (Cayley's map)."""
     ox, oy, oz = 0.5 * ox, 0.5 * oy, 0.5 * oz
@@ -86,7 +86,7 @@ def stepped(qx, qy, qz, qw, ox, oy, oz):
     return scale * x, scale * y, scale * z, scale * w
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def from_matrix(m):
     """Unit quaternion of a rotation matrix, the first three rows and columns of `m` (Shepperd 1978)."""
     trace = m[0, 0] + m[1, 1] + m[2, 2]
@@ -105,7 +105,7 @@ def from_matrix(m):
     return scale * x, scale * y, scale * z, scale * w
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def to_matrix(x, y, z, w, matrix):
     """Fill the first three rows and columns of `matrix` with the rotation of a unit quaternion."""
     matrix[0, 0], matrix[1, 1] = 1.0 - 2.0 * (y * y + z * z), 1.0 - 2.0 * (x * x + z * z)

@@ -7,7 +7,7 @@ that the compiler makes vector instructions of them.
 
 import numpy as np
 
-from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.compiled import FUSED, njit
 from lidarflow.kernels.rotations import (
     SERIES_BELOW,
     between,
@@ -35,7 +35,7 @@ def room():
     return np.zeros(_ROWS * WIDTH)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def put_poses(block, k, first, i, second, j):
     """Let the k-th pair be the rows i and j of poses (M, 7) and (N, 7)."""
     for row in range(7):
@@ -43,7 +43,7 @@ def put_poses(block, k, first, i, second, j):
         block[(_SECOND + row) * WIDTH + k] = second[j, row]
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def put_points(block, k, points, i, j, at_point):
     """Let the k-th pair sit at the i-th and j-th point; its twist is seen at the latter, or at the origin."""
     for row in range(3):
@@ -51,19 +51,19 @@ def put_points(block, k, points, i, j, at_point):
         block[(_LEVER + row) * WIDTH + k] = 0.0 if at_point else points[j, row]
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def put_together(block):
     """Let the poses of all pairs sit at the same point, where their twist is seen."""
     block[_OFFSET * WIDTH:(_LEVER + 3) * WIDTH] = 0.0
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def square(block, k):
     """Squared norm of the k-th pair's error."""
     return block[_SQUARE * WIDTH + k]
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def add_wrench(block, k, weight, wrenches, i):
     """Add the k-th pair's gradient, for a twist of the first pose about the origin, to the i-th wrench.
 
@@ -73,7 +73,7 @@ def add_wrench(block, k, weight, wrenches, i):
         wrenches[i, row] += weight * block[(_WRENCH + row) * WIDTH + k]
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def evaluate(block):
     """Fill in the errors of all pairs: the twist from the first pose to the second, less the offset."""
     if _relate(block) == 0:
@@ -83,17 +83,17 @@ def evaluate(block):
     _differentiate(block)
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _three(block, row, k):
     return block[row * WIDTH + k], block[(row + 1) * WIDTH + k], block[(row + 2) * WIDTH + k]
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _put_three(block, row, k, x, y, z):
     block[row * WIDTH + k], block[(row + 1) * WIDTH + k], block[(row + 2) * WIDTH + k] = x, y, z
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _relate(block):
     """Rotations and displacements between the poses; returns how many rotations are too large for series."""
     large = 0
@@ -112,7 +112,7 @@ def _relate(block):
     return large
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _take_logarithms(block):
     for k in range(WIDTH):
         x, y, z = _three(block, _TURN, k)
@@ -121,7 +121,7 @@ def _take_logarithms(block):
         block[(_TURN + 3) * WIDTH + k], block[(_TURN + 4) * WIDTH + k] = c, slope
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _take_large_logarithms(block):
     for k in range(WIDTH):
         x, y, z = _three(block, _TURN, k)
@@ -130,7 +130,7 @@ def _take_large_logarithms(block):
         block[(_TURN + 3) * WIDTH + k], block[(_TURN + 4) * WIDTH + k] = c, slope
 
 
-@njit(error_model="numpy")
+@njit(**FUSED)
 def _differentiate(block):
     """Squared norms, and the gradient of half of them."""
     for k in range(WIDTH):
