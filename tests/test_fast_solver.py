@@ -140,6 +140,22 @@ def test_wanted_components_are_split_from_each_other():
     assert found.bounds[-1] == wanted[component].sum() and found.edge_bounds[-1] == len(found.edges)
 
 
+@both_frames
+def test_levers_follow_variables_that_have_moved_far(config):
+    """To the point itself, or to where the sensor would be if it moved with the point."""
+    problem = tied_world(4, 0.3, 20.0).problem
+    _, _, factors, variables = linearised(problem, config, False)
+    expected = pose.apply(problem.initial, problem.points if config is POINT else np.zeros((1, 3)))
+    levers = np.full_like(expected, np.inf)
+    assert pose_graph.place_levers(factors, variables, 0.05, levers)
+    assert_allclose(levers, expected, atol=1e-9)
+    variables[7, 4:] += [0.0, 0.04, 0.0]
+    assert not pose_graph.place_levers(factors, variables, 0.05, levers)
+    assert_allclose(levers, expected, atol=1e-9)
+    assert pose_graph.place_levers(factors, variables, 0.03, levers)
+    assert_allclose(levers[7], expected[7] + [0.0, 0.04, 0.0], atol=1e-9)
+
+
 # --- agreement with gtsam ---
 
 def assert_agreement(problem, config, min_matches=MIN_MATCHES, flow_rms_m=5e-3):

@@ -68,7 +68,7 @@ def _flat(levels, stiffness):
     up_start[nodes] = down_start[nodes] = edges
     return Hierarchy(
         bounds, up_start, up, np.arange(edges).astype(np.int32), down_start, down, down_edge, parent,
-        edge_parent, stiffness, np.empty((bounds[1], 3)), np.empty((edges - ends[1], SIZE)),
+        edge_parent, stiffness, np.full((bounds[1], 3), np.inf), np.empty((edges - ends[1], SIZE)),
         np.empty((nodes, SIZE)))
 
 

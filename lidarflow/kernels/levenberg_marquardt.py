@@ -11,11 +11,12 @@ from lidarflow.kernels.hierarchy import build, weigh
 
 # Where an iteration gains less than relative_tolerance of the energy, or absolute_tolerance, it is the last,
 # unless the kernel let go or took back a match or a tie: then the next one may gain more. Components of fewer
-# than `small` variables may be tried twice, see `_try_again`. The others are those of multigrid.solve, with
-# what is negligible as a share of the gain below which an iteration is the last.
+# than `small` variables may be tried twice, see `_try_again`. The equations are set up anew where a lever has
+# moved farther than `same_place` since; energy and gradient are exact, whatever these are. The others are
+# those of multigrid.solve, with what is negligible as a share of the gain below which one is the last.
 Limits = namedtuple("Limits", (
     "max_iterations", "relative_tolerance", "absolute_tolerance", "step_tolerance", "negligible",
-    "max_products", "small", "min_matches"))
+    "max_products", "small", "min_matches", "same_place"))
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-5, 1e5, 10.0    # as in gtsam
 _SURELY_LESS = 0.03    # a cycle foresees at least this share of what there is to gain
 _CLEARLY_LOWER = 0.99  # below this share of an energy, another minimum is worth leaving gtsam's answer for
@@ -125,13 +126,15 @@ def _step(factors, hierarchy, room, limits, state, robust, smooth, here, figures
     energy = _energy(factors, variables, robust, smooth, state, here)
     figures[1] = energy
     damping = _FIRST_DAMPING
-    moved = True
+    held = False
     while figures[0] < limits.max_iterations and damping <= _MOST_DAMPING:
-        if moved:
-            pose_graph.place_levers(factors, variables, hierarchy.lever)
+        if pose_graph.place_levers(factors, variables, limits.same_place, hierarchy.lever):
             weigh(hierarchy)
-        multigrid.hold(hierarchy, room, variables[:, 4:], active[here], factors.weights.data,
-                       factors.weights.tie, damping)
+            held = False
+        if not held:
+            multigrid.hold(hierarchy, room, variables[:, 4:], active[here], factors.weights.data,
+                           factors.weights.tie, damping)
+            held = True
         least = max(limits.relative_tolerance * energy, limits.absolute_tolerance)
         products = multigrid.solve(
             hierarchy, room, state.gradients[here], limits.step_tolerance, limits.negligible * least,
@@ -145,14 +148,16 @@ def _step(factors, hierarchy, room, limits, state, robust, smooth, here, figures
         trial_smooth = pose_graph.smoothness(factors, trials, state.block, state.smoothness[there])
         found = _energy(factors, trials, robust, trial_smooth, state, there)
         gained = energy - found
-        moved = gained >= 0.0
-        if not moved:
+        if not gained >= 0.0:
             damping *= _DAMPING_FACTOR
+            held = False
             continue
         figures[0] += 1
+        held = damping == _FIRST_DAMPING
         damping = max(damping / _DAMPING_FACTOR, _FIRST_DAMPING)
         variables[:] = trials
         settled = np.array_equal(active[here], active[there])
+        held = held and settled
         energy, smooth, here = found, trial_smooth, there
         if gained < least and settled:
             break

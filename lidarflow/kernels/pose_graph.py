@@ -208,16 +208,26 @@ def step(variables, twists, moved):
 
 
 @njit(**FUSED)
-def place_levers(factors, variables, levers):
+def place_levers(factors, variables, most, levers):
     """Put `levers` (M, 3) where the twist between a variable and an earlier neighbour is seen.
 
-    That is at the point, or at what the sensor's origin becomes when it moves with the point.
+    That is at the point, or at what the sensor's origin becomes when it moves with the point. Where all are
+    within `most` of there, they stay as they are. Returns whether they do not.
     """
-    points, at_point = factors.points, factors.weights.at_point
     for i in range(len(variables)):
-        x = y = z = 0.0
-        if not at_point:
-            x, y, z = turned(variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3],
-                             points[i, 0], points[i, 1], points[i, 2])
-        levers[i, 0], levers[i, 1], levers[i, 2] = (
-            variables[i, 4] - x, variables[i, 5] - y, variables[i, 6] - z)
+        x, y, z = _lever(factors, variables, i)
+        x, y, z = x - levers[i, 0], y - levers[i, 1], z - levers[i, 2]
+        if not x * x + y * y + z * z <= most * most:
+            for j in range(len(variables)):
+                levers[j, 0], levers[j, 1], levers[j, 2] = _lever(factors, variables, j)
+            return True
+    return False
+
+
+@njit(**FUSED)
+def _lever(factors, variables, i):
+    if factors.weights.at_point:
+        return variables[i, 4], variables[i, 5], variables[i, 6]
+    x, y, z = turned(variables[i, 0], variables[i, 1], variables[i, 2], variables[i, 3],
+                     factors.points[i, 0], factors.points[i, 1], factors.points[i, 2])
+    return variables[i, 4] - x, variables[i, 5] - y, variables[i, 6] - z

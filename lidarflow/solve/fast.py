@@ -19,6 +19,7 @@ from lidarflow.types import FlowProblem, SolveStats
 _STEP_TOLERANCE = 0.03    # conjugate gradients stop where less than this is left to add to their gain
 _NEGLIGIBLE = 0.03        # or less than this share of the gain below which an iteration is the last
 _MAX_PRODUCTS = 50
+_SAME_PLACE_M = 0.05      # the equations are set up anew where something has moved farther
 _SMALL = 200              # components of fewer variables often have several minima, and are tried twice
 
 
@@ -51,7 +52,7 @@ def _optimise(
     largest_first = np.argsort(-np.diff(components.bounds), kind="stable")
     limits = levenberg_marquardt.Limits(
         config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE, _STEP_TOLERANCE,
-        _NEGLIGIBLE, _MAX_PRODUCTS, _SMALL, min_matches)
+        _NEGLIGIBLE, _MAX_PRODUCTS, _SMALL, min_matches, _SAME_PLACE_M)
     return levenberg_marquardt.optimise_each(
         graph_of(problem), weights_of(config), components, largest_first, queue.tasks(),
         numba.get_num_threads(), limits, motions)
