@@ -75,14 +75,14 @@ def mesh(shape):
     return points, edges[np.lexsort(edges.T[::-1])].astype(np.int32)
 
 
-def prepared(at_sensor: bool, shape):
-    """A hierarchy with random evidence, ready to solve, and the dense normal equations of the points' edges
-    and of what holds the points."""
+def prepared(at_sensor: bool, shape, all_tied: bool = False):
+    """A hierarchy with random evidence, or with ties of all points, ready to solve, and the dense normal
+    equations of the points' edges and of what holds the points."""
     points, edges = mesh(shape)
     levels = hierarchy.build(edges, len(points), STIFFNESS)
     levels.lever[:] = 0.1 * points if at_sensor else points
     room = multigrid.room_for(levels)
-    active = rng(5).integers(0, 4, len(points)).astype(np.uint8)
+    active = rng(5).integers(2 * all_tied, 4, len(points)).astype(np.uint8)
     hierarchy.weigh(levels)
     multigrid.hold(levels, room, points, active, DATA, TIE, DAMPING)
     joined, held = np.zeros((2, len(points), 6, len(points), 6))
@@ -183,6 +183,18 @@ def test_directions_come_with_their_product(at_sensor, shape):
         product = (joined + held) @ expected.ravel()
         assert_allclose(room.product.ravel(), product, atol=1e-10 * np.abs(product).max())
         assert_allclose(total, product @ expected.ravel(), rtol=1e-10)
+
+
+@pytest.mark.parametrize("all_tied", [False, True])
+def test_a_cycle_that_is_about_the_inverse_is_made_once(all_tied):
+    levels, room, joined, held = prepared(False, (16, 9), all_tied)
+    gradient = rng(6).normal(size=(len(levels.lever), 6))
+    products = multigrid.solve(levels, room, gradient, 0.05, 0.0, 0.0, 200)
+    same = np.abs(np.corrcoef(room.step.ravel(), room.twists[:len(room.step)].ravel())[0, 1] - 1.0) < 1e-9
+    assert same == all_tied and (products == 1 or not all_tied)
+    step, matrix, pull = room.step.ravel(), joined + held, gradient.ravel()
+    gain, most = -step @ pull - 0.5 * step @ matrix @ step, 0.5 * pull @ np.linalg.solve(matrix, pull)
+    assert 0.95 * most < gain <= most
 
 
 def test_negligible_gains_end_the_iterations():

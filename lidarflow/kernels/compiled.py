@@ -41,8 +41,7 @@ def _is_writable(folder: Path) -> bool:
 
 
 FOLDER = cache_folder(Path(__file__).parent, numba.config.CACHE_DIR)
-# For arithmetic: numbers are divided as in numpy, and a product is added to without being rounded first, which
-# is one instruction where it would be two.
+# For arithmetic: numbers are divided as in numpy, and products are added up without being rounded first.
 FUSED = {"error_model": "numpy", "fastmath": {"contract"}}
 
 

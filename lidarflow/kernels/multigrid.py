@@ -261,9 +261,10 @@ def solve(hierarchy, room, gradient, tolerance, little, enough, most):
     """Fill `step` (M, 6) with the twists that minimise the quadratic model of the energy.
 
     Conjugate gradients, until a cycle foresees less than `tolerance` of what all iterations have gained, or
-    `little`, or `most` iterations. That last cycle's twists are part of the step as they are. Where less than
-    `enough` seems to be there to gain from the start, no step is made. Returns how many iterations were made,
-    each with a cycle and a product, or -1 for no step.
+    `little`, or `most` iterations. That last cycle's twists are part of the step as they are. It is not made
+    where the first one's were of the best length within `tolerance`: what strong ties and matches hold is
+    about solved by one cycle. Where less than `enough` seems to be there to gain from the start, no step is
+    made. Returns how many iterations were made, each with a cycle and a product, or -1 for no step.
     """
     loads, step, direction, product = room.loads, room.step, room.direction, room.product
     for i in range(len(step)):
@@ -282,6 +283,8 @@ def solve(hierarchy, room, gradient, tolerance, little, enough, most):
         length = square / _turn(hierarchy, room, square / last_square if iteration else 0.0)
         _add_all(step, length, direction, len(step))
         _add_all(loads, -length, product, len(step))
+        if iteration == 0 and abs(length - 1.0) <= tolerance:
+            return 1
         last_square = square
         gain += 0.5 * length * square
     return most

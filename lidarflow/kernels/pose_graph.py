@@ -110,8 +110,9 @@ def smoothness(factors, variables, block, wrenches):
         twist_errors.evaluate(block)
         for k in range(count):
             total += twist_errors.square(block, k)
-            twist_errors.add_wrench(block, k, weight, wrenches, pairs[start + k, 0])
-            twist_errors.add_wrench(block, k, -weight, wrenches, pairs[start + k, 1])
+            tx, ty, tz, fx, fy, fz = twist_errors.wrench(block, k, weight)
+            _add(wrenches, pairs[start + k, 0], tx, ty, tz, fx, fy, fz)
+            _add(wrenches, pairs[start + k, 1], -tx, -ty, -tz, -fx, -fy, -fz)
     return 0.5 * weight * total
 
 
@@ -143,14 +144,20 @@ def _matches(factors, variables, robust, wrenches, active):
             continue
         total += square
         active[i] += 1
+        fx, fy, fz = weight * fx, weight * fy, weight * fz
         tx, ty, tz = cross(x, y, z, fx, fy, fz)
-        wrenches[i, 0] += weight * tx
-        wrenches[i, 1] += weight * ty
-        wrenches[i, 2] += weight * tz
-        wrenches[i, 3] += weight * fx
-        wrenches[i, 4] += weight * fy
-        wrenches[i, 5] += weight * fz
+        _add(wrenches, i, tx, ty, tz, fx, fy, fz)
     return 0.5 * weight * total
+
+
+@njit(**FUSED)
+def _add(wrenches, i, tx, ty, tz, fx, fy, fz):
+    wrenches[i, 0] += tx
+    wrenches[i, 1] += ty
+    wrenches[i, 2] += tz
+    wrenches[i, 3] += fx
+    wrenches[i, 4] += fy
+    wrenches[i, 5] += fz
 
 
 @njit(**FUSED)
@@ -190,7 +197,7 @@ def _ties(factors, variables, robust, block, wrenches, active):
                 continue
             total += square
             active[start + k] += 2
-            twist_errors.add_wrench(block, k, -weight, wrenches, start + k)
+            _add(wrenches, start + k, *twist_errors.wrench(block, k, -weight))
     return 0.5 * weight * total
 
 

@@ -64,13 +64,14 @@ def square(block, k):
 
 
 @njit(**FUSED)
-def add_wrench(block, k, weight, wrenches, i):
-    """Add the k-th pair's gradient, for a twist of the first pose about the origin, to the i-th wrench.
+def wrench(block, k, weight):
+    """The k-th pair's gradient, for a twist of the first pose about the origin.
 
     For a twist of the second pose it is the opposite: a common twist changes nothing.
     """
-    for row in range(6):
-        wrenches[i, row] += weight * block[(_WRENCH + row) * WIDTH + k]
+    tx, ty, tz = _three(block, _WRENCH, k)
+    fx, fy, fz = _three(block, _WRENCH + 3, k)
+    return weight * tx, weight * ty, weight * tz, weight * fx, weight * fy, weight * fz
 
 
 @njit(**FUSED)
