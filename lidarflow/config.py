@@ -109,6 +109,7 @@ class SolverConfig:
         100.0, "weight of a squared twist between a point and its object's, or the world's, motion", low=1e-6)
     tie_truncation: float = setting(
         0.15, "such a twist (metres and radians) beyond this lets the point go", low=1e-3)
+    plain_first: bool = setting(True, "solve without truncation first; false = with it from the start")
     max_iterations: int = setting(50, "Levenberg-Marquardt iterations per step and component", low=1)
     relative_tolerance: float = setting(1e-4, "stop when an iteration gains less than this share", low=0)
 

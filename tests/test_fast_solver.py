@@ -193,9 +193,10 @@ def test_large_bodies_agree_with_gtsam(config):
 
 
 @both_frames
-def test_tied_bodies_agree_with_gtsam(config):
+@pytest.mark.parametrize("plain_first", [True, False])
+def test_tied_bodies_agree_with_gtsam(config, plain_first):
     for seed in range(3):
-        assert_agreement(tied_world(20 + seed).problem, config)
+        assert_agreement(tied_world(20 + seed).problem, replace(config, plain_first=plain_first))
 
 
 @needs_shared

@@ -205,6 +205,22 @@ def test_a_point_without_edges_moves_by_its_match_alone(solve):
     assert_allclose(motions[0], world.motions[0], atol=max(1e-6, solve.exact_m))
 
 
+def test_without_the_plain_step_a_near_start_is_kept(solve):
+    """Most matches are wrong, all by the same: the plain step follows them, a right start does not."""
+    world = worlds.moved_room(0.8, 5.0, rng(21), noise_m=0.005)
+    wrong = rng(22).random(len(world.problem.match_index)) < 0.7
+    target = world.problem.match_target + np.where(wrong[:, None], [0.0, 0.5, 0.0], 0.0)
+    problem = replace(world.problem, match_target=target, initial=world.motions)
+    followed, _, both = solve(problem)
+    kept, solved, stats = solve(problem, SolverConfig(plain_first=False))
+    assert world.error_m(followed).min() > 0.3 and world.error_m(kept).max() < 0.03
+    assert solved.all() and stats.inliers == (~wrong).sum() and both.inliers == wrong.sum()
+    assert both.plain_iterations > 0 and both.stopped == {"converged": 2}
+    assert (stats.plain_iterations, stats.plain_initial_error, stats.plain_final_error) == (0, 0.0, 0.0)
+    assert stats.stopped == {"converged": 1} and stats.robust_iterations > 0
+    assert_allclose(stats.robust_initial_error, energy(problem, problem.initial, DEFAULT), rtol=1e-9)
+
+
 # --- what the solver says of itself ---
 
 @both_frames

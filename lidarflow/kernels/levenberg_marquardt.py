@@ -9,14 +9,15 @@ from lidarflow.kernels import multigrid, pose_graph, queue, twist_errors
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.hierarchy import build, weigh
 
+# Without `plain_first` only the second step is made, from the start values.
 # Where an iteration gains less than relative_tolerance of the energy, or absolute_tolerance, it is the last,
 # unless the kernel let go or took back a match or a tie: then the next one may gain more. Components of fewer
 # than `small` variables may be tried twice, see `_try_again`. The equations are set up anew where a lever has
 # moved farther than `same_place` since; energy and gradient are exact, whatever these are. The others are
 # those of multigrid.solve, with what is negligible as a share of the gain below which one is the last.
 Limits = namedtuple("Limits", (
-    "max_iterations", "relative_tolerance", "absolute_tolerance", "step_tolerance", "negligible",
-    "max_products", "small", "min_matches", "same_place"))
+    "plain_first", "max_iterations", "relative_tolerance", "absolute_tolerance", "step_tolerance",
+    "negligible", "max_products", "small", "min_matches", "same_place"))
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-5, 1e5, 10.0    # as in gtsam
 _SURELY_LESS = 0.03    # a cycle foresees at least this share of what there is to gain
 _CLEARLY_LOWER = 0.99  # below this share of an energy, another minimum is worth leaving gtsam's answer for
@@ -39,7 +40,7 @@ def state_at(variables):
 
 @njit(parallel=True)
 def optimise_each(graph, weights, parts, order, waiting, threads, limits, motions):
-    """Move the variables of all parts to the minimum: without, then with the truncated kernels.
+    """Move the variables of all parts to the minimum: without (if wanted), then with the truncated kernels.
 
     motions (N, 4, 4) are those of the graph to start from, and become what is found. Each of so many threads
     takes the next part of `order` (C,) from the queue `waiting` when it has done one; who does which changes
@@ -58,7 +59,7 @@ def optimise_each(graph, weights, parts, order, waiting, threads, limits, motion
 
 @njit(error_model="numpy")
 def _optimise(graph, weights, parts, c, limits, motions, figures):
-    """Both steps for part c; the second starts with the smoothness that the first ended with.
+    """The steps for part c; the second starts with the smoothness that the first ended with.
 
     Returns how many matches it keeps.
     """
@@ -76,10 +77,10 @@ def _optimise(graph, weights, parts, c, limits, motions, figures):
     near, count = pose_graph.near_matches(factors, variables)
     smooth = pose_graph.smoothness(factors, variables, state.block, state.smoothness[0])
     here = 0
-    for robust in range(2):
+    for robust in range(0 if limits.plain_first else 1, 2):
         smooth, here = _step(
             factors, hierarchy, room, limits, state, robust == 1, smooth, here, figures[robust])
-    if len(rows) < limits.small and limits.min_matches <= near < count:
+    if limits.plain_first and len(rows) < limits.small and limits.min_matches <= near < count:
         _try_again(factors, hierarchy, room, limits, state, figures[1])
     near, _ = pose_graph.near_matches(factors, variables)
     if near >= limits.min_matches:

@@ -93,11 +93,12 @@ def rematched(problem: FlowProblem, motions: np.ndarray, surface: Surface, reach
 def solver(config: SolverConfig, limits: RefineConfig) -> SolverConfig:
     """The solver's settings for matches with a surface, which lie nearer than those of descriptors.
 
-    The surface is asked again after every solution, which therefore need not be exact.
+    The surface is asked again after every solution, which therefore need not be exact. What is beyond the
+    truncation at the start are limbs that have left their body: a step without it would pull them back.
     """
     return replace(
-        config, relative_tolerance=_TOLERANCE, data_weight=limits.data_weight, truncation_m=limits.reach_m,
-        tie_weight=limits.tie_weight, tie_truncation=limits.tie_truncation)
+        config, plain_first=False, relative_tolerance=_TOLERANCE, data_weight=limits.data_weight,
+        truncation_m=limits.reach_m, tie_weight=limits.tie_weight, tie_truncation=limits.tie_truncation)
 
 
 def wanted(problem: FlowProblem, config: RefineConfig) -> np.ndarray:

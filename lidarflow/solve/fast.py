@@ -36,7 +36,7 @@ def solve(
     motions, kept = np.array(problem.initial, np.float64), np.zeros(len(tried), np.int64)
     figures, kept[tried] = _optimise(problem, tried, config, min_matches, motions)
     steps = [[common.Step(int(f[0]), f[1], f[2], common.AT_LIMIT if f[3] else common.CONVERGED) for f in rows]
-             for rows in (figures[:, 0].tolist(), figures[:, 1].tolist())]
+             for rows in (figures[:, 0].tolist() if config.plain_first else [], figures[:, 1].tolist())]
     solved, stats = common.concluded("fast", problem, kept >= min_matches, kept, *steps)
     return motions, solved, stats
 
@@ -51,8 +51,8 @@ def _optimise(
     components = parts.split(problem.component, problem.edges, tried)
     largest_first = np.argsort(-np.diff(components.bounds), kind="stable")
     limits = levenberg_marquardt.Limits(
-        config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE, _STEP_TOLERANCE,
-        _NEGLIGIBLE, _MAX_PRODUCTS, _SMALL, min_matches, _SAME_PLACE_M)
+        config.plain_first, config.max_iterations, config.relative_tolerance, common.ABSOLUTE_TOLERANCE,
+        _STEP_TOLERANCE, _NEGLIGIBLE, _MAX_PRODUCTS, _SMALL, min_matches, _SAME_PLACE_M)
     return levenberg_marquardt.optimise_each(
         graph_of(problem), weights_of(config), components, largest_first, queue.tasks(),
         numba.get_num_threads(), limits, motions)

@@ -23,22 +23,23 @@ def solve(
 ) -> tuple[np.ndarray, np.ndarray, SolveStats]:
     """Motions (M, 4, 4) of all variables, whether each was solved (M,), and what the solver did.
 
-    Components are independent problems (Dewan et al. 2016, section IV). Each is optimised first without,
-    then with the truncated kernel (eq. 13). A component with fewer than `min_matches` matches, or whose
-    matches the kernel lets go until fewer are left, has no unique solution and keeps its start value. Raises
-    SolveError for a problem with numbers that are not finite.
+    Components are independent problems (Dewan et al. 2016, section IV). Each is optimised first without (if
+    config.plain_first), then with the truncated kernel (eq. 13). A component with fewer than `min_matches`
+    matches, or whose matches the kernel lets go until fewer are left, has no unique solution and keeps its
+    start value. Raises SolveError for a problem with numbers that are not finite.
     """
     common.require_finite(problem)
     found = problem.initial.copy()
     min_matches = max(min_matches, 1)
     tried = common.matches_per_component(problem) >= min_matches
-    plain, robust = [], []
+    plain: list[Step] = []
+    robust = []
     for part in _components(problem):
         if not tried[problem.component[part.rows[0]]]:
             continue
-        found[part.rows], plain_step, robust_step = _solve_component(part, config)
-        plain.append(plain_step)
-        robust.append(robust_step)
+        found[part.rows], (*first, last) = _solve_component(part, config)
+        plain += first
+        robust.append(last)
     index = problem.match_index
     off_m = pose.apply(found[index], problem.points[index]) - problem.match_target
     kept = common.matches_per_component(problem, (off_m**2).sum(axis=1) <= config.truncation_m**2)
@@ -86,19 +87,21 @@ def _grouped(label: np.ndarray, count: int) -> list[np.ndarray]:
     return np.split(order, np.searchsorted(label[order], np.arange(1, count))) if count else []
 
 
-def _solve_component(part: _Component, config: SolverConfig) -> tuple[np.ndarray, Step, Step]:
+def _solve_component(part: _Component, config: SolverConfig) -> tuple[np.ndarray, list[Step]]:
+    """Motions (M, 4, 4) of a component, and the steps that led there, the truncated one last."""
     smoothness = _smoothness_factors(part, config)
     values = _values(part.initial, part.points)
     steps = []
-    noises = ((_data_noise(config), _tie_noise(config)),
-              (_robust_data_noise(config), _robust_tie_noise(config)))
+    noises = [(_robust_data_noise(config), _robust_tie_noise(config))]
+    if config.plain_first:
+        noises.insert(0, (_data_noise(config), _tie_noise(config)))
     for data_noise, tie_noise in noises:
         graph = gtsam.NonlinearFactorGraph(smoothness)
         graph.push_back(_data_factors(part, data_noise))
         graph.push_back(_tie_factors(part, tie_noise))
         values, step = _optimise(graph, values, config)
         steps.append(step)
-    return _motions(values, part.points), steps[0], steps[1]
+    return _motions(values, part.points), steps
 
 
 def _values(motions: np.ndarray, points: np.ndarray) -> gtsam.Values:
