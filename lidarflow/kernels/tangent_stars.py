@@ -135,7 +135,8 @@ def _on_surface(i, cloud, order, starts, ends, run_count, reach_m, limits, min_a
                 near[count], near_sq[count] = j, apart_sq
                 count += 1
     if count > _MAX_NEIGHBOURS:
-        return near[:count][np.argsort(near_sq[:count])[:_MAX_NEIGHBOURS]]
+        farthest_sq = np.partition(near_sq[:count], _MAX_NEIGHBOURS - 1)[_MAX_NEIGHBOURS - 1]
+        return near[:count][near_sq[:count] <= farthest_sq][:_MAX_NEIGHBOURS]
     return near[:count]
 
 
