@@ -331,6 +331,29 @@ def test_a_body_is_completed_by_what_it_surrounds_and_what_follows_it():
 
 
 @needs_shared
+def test_what_begins_too_slow_or_explains_too_little_does_not_grow(monkeypatch):
+    view = scene(np.array([0.6, 0.0, 0.0]), 14)
+    found = seeds.find(view, tree.NOTHING, CONFIG)
+
+    def tried(min_speed_m_per_s: float) -> list[np.ndarray]:
+        """The starts of what is grown, where objects are at least that fast."""
+        starts: list[np.ndarray] = []
+
+        def grown(_view, _seeds, given, *_others):
+            starts.extend(given)
+            return [body_of.Growth(None, np.zeros(len(view.points), bool)) for _ in given]
+
+        monkeypatch.setattr(body_of, "grown", grown)
+        assert objects.find(view, found, 0.1, replace(CONFIG, min_speed_m_per_s=min_speed_m_per_s)) == []
+        return starts
+
+    start, = tried(11.0)     # half of it is 0.55 m a scan
+    assert pose.translation_distance(start, pose.from_translation([0.6, 0.0, 0.0])) < 0.1
+    assert tried(14.0) == []
+    monkeypatch.setattr(objects, "_MAX_START_RATIO", 1e-6)
+    assert tried(11.0) == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kitti_tracked_0005_from_000", "kitti_tracked_0005_from_040"])
 def test_tracked_kitti_drives(name):

@@ -32,7 +32,7 @@ def find(
     `expected` is what earlier pairs lead to expect: it is looked for where it should be, and believed no
     more easily than the rest. `each` judges candidates, several at a time if it can.
     """
-    least_m = _MIN_START_SPEED * config.min_speed_m_per_s * dt_s
+    least_m = _least_shift_m(dt_s, config)
     starts = _best_starts(view, found, found.clusters, expected, least_m)
     bodies, free = [], np.ones(len(view.points), bool)
     # All are looked at as if each were alone; who meets what another has taken is looked at again.
@@ -62,7 +62,7 @@ def _candidates(
     config: ObjectsConfig, each: Each,
 ) -> list[Growth]:
     """What grows of seeds, rows (K,) each, over the rows that are `free` (N,), and moves."""
-    grown = body.grown(view, seeds, starts, free, _MIN_START_SPEED * config.min_speed_m_per_s * dt_s, config)
+    grown = body.grown(view, seeds, starts, free, _least_shift_m(dt_s, config), config)
     grown = _those(grown, lambda own: seems_to_move(view, own, dt_s, config), each)
     _match_at_once(view, grown)
     grown = _those(grown, lambda own: matches_agree(view, own, config), one_by_one)
@@ -135,6 +135,11 @@ def _best_starts(
                 start = None
         best.append(start)
     return best
+
+
+def _least_shift_m(dt_s: float, config: ObjectsConfig) -> float:
+    """How far along the ground a body must move to be looked at further."""
+    return _MIN_START_SPEED * config.min_speed_m_per_s * dt_s
 
 
 def _misfit_sq(left: Misfit) -> float:
