@@ -76,3 +76,14 @@ def twist(inverses, i, tx, ty, tz, fx, fy, fz):
     oz = inverses[i, 6] * tx + inverses[i, 8] * ty + inverses[i, 9] * tz
     vx, vy, vz = cross(x, y, z, ox, oy, oz)
     return ox, oy, oz, vx + by_m * fx, vy + by_m * fy, vz + by_m * fz
+
+
+@njit(**FUSED)
+def add_to(rows, i, a, b, c, d, e, f):
+    """Add six numbers to the i-th of some twists or wrenches (N, 6)."""
+    rows[i, 0] += a
+    rows[i, 1] += b
+    rows[i, 2] += c
+    rows[i, 3] += d
+    rows[i, 4] += e
+    rows[i, 5] += f

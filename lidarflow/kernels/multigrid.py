@@ -80,16 +80,6 @@ def _set(rows, i, a, b, c, d, e, f):
 
 
 @njit(**FUSED)
-def _add(rows, i, a, b, c, d, e, f):
-    rows[i, 0] += a
-    rows[i, 1] += b
-    rows[i, 2] += c
-    rows[i, 3] += d
-    rows[i, 4] += e
-    rows[i, 5] += f
-
-
-@njit(**FUSED)
 def _loaded(loads, i, s, a, b, c, d, e, f):
     """The load of a node and what its neighbours add, times s."""
     return (loads[i, 0] + s * a, loads[i, 1] + s * b, loads[i, 2] + s * c,
@@ -116,7 +106,7 @@ def _points_down(hierarchy, room):
         # Where point i was solved, the later ones were at rest: their pull is what is left.
         a, b, c, d, e, f = _sum(up, up_start[i], up_start[i + 1], seen)
         if parent[i] >= 0:
-            _add(loads, parent[i], s * a, s * b, s * c, s * d, s * e, s * f)
+            inertia.add_to(loads, parent[i], s * a, s * b, s * c, s * d, s * e, s * f)
 
 
 @njit(**FUSED)
@@ -170,7 +160,7 @@ def _nodes_down(hierarchy, room, first, last):
     for i in range(first, last):
         if parent[i] >= 0:
             a, b, c, d, e, f = _pull(inertias, twists, up_edge, first_edge, up, up_start[i], up_start[i + 1])
-            _add(loads, parent[i], a, b, c, d, e, f)
+            inertia.add_to(loads, parent[i], a, b, c, d, e, f)
 
 
 @njit(**FUSED)

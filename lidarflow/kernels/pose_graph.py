@@ -9,7 +9,7 @@ from collections import namedtuple
 
 import numpy as np
 
-from lidarflow.kernels import twist_errors
+from lidarflow.kernels import inertia, twist_errors
 from lidarflow.kernels.compiled import FUSED, njit
 from lidarflow.kernels.rotations import cross, from_matrix, stepped, to_matrix, turned
 
@@ -111,8 +111,8 @@ def smoothness(factors, variables, block, wrenches):
         for k in range(count):
             total += twist_errors.square(block, k)
             tx, ty, tz, fx, fy, fz = twist_errors.wrench(block, k, weight)
-            _add(wrenches, pairs[start + k, 0], tx, ty, tz, fx, fy, fz)
-            _add(wrenches, pairs[start + k, 1], -tx, -ty, -tz, -fx, -fy, -fz)
+            inertia.add_to(wrenches, pairs[start + k, 0], tx, ty, tz, fx, fy, fz)
+            inertia.add_to(wrenches, pairs[start + k, 1], -tx, -ty, -tz, -fx, -fy, -fz)
     return 0.5 * weight * total
 
 
@@ -146,18 +146,8 @@ def _matches(factors, variables, robust, wrenches, active):
         active[i] += 1
         fx, fy, fz = weight * fx, weight * fy, weight * fz
         tx, ty, tz = cross(x, y, z, fx, fy, fz)
-        _add(wrenches, i, tx, ty, tz, fx, fy, fz)
+        inertia.add_to(wrenches, i, tx, ty, tz, fx, fy, fz)
     return 0.5 * weight * total
-
-
-@njit(**FUSED)
-def _add(wrenches, i, tx, ty, tz, fx, fy, fz):
-    wrenches[i, 0] += tx
-    wrenches[i, 1] += ty
-    wrenches[i, 2] += tz
-    wrenches[i, 3] += fx
-    wrenches[i, 4] += fy
-    wrenches[i, 5] += fz
 
 
 @njit(**FUSED)
@@ -197,7 +187,7 @@ def _ties(factors, variables, robust, block, wrenches, active):
                 continue
             total += square
             active[start + k] += 2
-            _add(wrenches, start + k, *twist_errors.wrench(block, k, -weight))
+            inertia.add_to(wrenches, start + k, *twist_errors.wrench(block, k, -weight))
     return 0.5 * weight * total
 
 
