@@ -330,7 +330,6 @@ def test_a_body_is_completed_by_what_it_surrounds_and_what_follows_it():
     assert body_of.completed(view, none, everywhere) is none
 
 
-@needs_shared
 def test_what_begins_too_slow_or_explains_too_little_does_not_grow(monkeypatch):
     view = scene(np.array([0.6, 0.0, 0.0]), 14)
     found = seeds.find(view, tree.NOTHING, CONFIG)
@@ -354,6 +353,7 @@ def test_what_begins_too_slow_or_explains_too_little_does_not_grow(monkeypatch):
     assert tried(11.0) == []
 
 
+@needs_shared
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kitti_tracked_0005_from_000", "kitti_tracked_0005_from_040"])
 def test_tracked_kitti_drives(name):
