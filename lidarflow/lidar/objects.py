@@ -124,17 +124,20 @@ def _best_starts(
     left_sq = misfit_kernel.mean_sq_after(
         view.points, view.source.normals, *rigid_fit.concatenated(rows), group, fits, view.upright.tree,
         view.upright.normals, view.ground, CAP_M, MIN_AGREEMENT, _DISTANCE_WEIGHT)
-    best = []
+    best: list[np.ndarray | None] = [None] * len(clusters)
     for number, own in enumerate(rows):
         mine = np.flatnonzero(group == number)
-        start = None
         if len(mine) and left_sq[mine].min() <= _MAX_START_RATIO * _misfit_sq(view.by_ego[own]):
             start = fits[mine[np.argmin(left_sq[mine])]]
-            centre = view.points[own].mean(axis=0)
-            if np.hypot(*(pose.apply(start, centre[None]) - centre)[0, :2]) < least_m:
-                start = None
-        best.append(start)
+            if _along_ground_m(view.points[own].mean(axis=0), start) >= least_m:
+                best[number] = start
     return best
+
+
+def _along_ground_m(place: np.ndarray, motion: np.ndarray) -> float:
+    """How far along the ground a motion (4, 4) takes a place (3,)."""
+    shift = pose.apply(motion, place[None])[0] - place
+    return float(np.hypot(shift[0], shift[1]))
 
 
 def _least_shift_m(dt_s: float, config: ObjectsConfig) -> float:
