@@ -70,7 +70,7 @@ def _optimise(graph, weights, parts, c, limits, motions, figures):
     variables = pose_graph.variables_of(motions, rows, factors.points)
     # Twists are about the origin of the target's frame: each part gets one of its own, near to it.
     origin = variables[0, 4:].copy()
-    pose_graph.shift(variables, factors, origin, -1.0)
+    pose_graph.recentre(variables, factors, origin)
     hierarchy, state = build(edges, len(rows), weights.smoothness), state_at(variables)
     room = multigrid.room_for(hierarchy)
 
@@ -84,7 +84,7 @@ def _optimise(graph, weights, parts, c, limits, motions, figures):
         _try_again(factors, hierarchy, room, limits, state, figures[1])
     near, _ = pose_graph.near_matches(factors, variables)
     if near >= limits.min_matches:
-        pose_graph.shift(variables, factors, origin, 1.0)
+        variables[:, 4:] += origin
         pose_graph.motions_of(variables, factors.points, rows, motions)
     return near
 

@@ -72,19 +72,12 @@ def after(points, normals, rows, motion, target, target_normals, beside, cap_m, 
     the plane of the nearest of `target` within twice the cap where normals agree, and never more.
     """
     for k in range(len(rows)):
-        distance_m[k], plane_m[k] = after_one(
-            points[rows[k]], normals[rows[k]], motion, target, target_normals, beside, cap_m, min_agreement)
-
-
-@njit()
-def after_one(point, normal, motion, target, target_normals, beside, cap_m, min_agreement):
-    """As `after`, of one point (3,) with a normal (3,): its distance and its plane distance."""
-    x, y, z = moved(point, motion)
-    place, apart_sq = trees.nearest(target, x, y, z, 4.0 * cap_m * cap_m, -1)
-    _, nearest_sq = trees.nearest(beside, x, y, z, min(apart_sq, cap_m * cap_m), -1)
-    distance_m = math.sqrt(nearest_sq)
-    plane_m = plane_distance(x, y, z, place, normal, motion, target, target_normals, min_agreement)
-    return distance_m, min(plane_m, distance_m)
+        x, y, z = moved(points[rows[k]], motion)
+        place, apart_sq = trees.nearest(target, x, y, z, 4.0 * cap_m * cap_m, -1)
+        _, nearest_sq = trees.nearest(beside, x, y, z, min(apart_sq, cap_m * cap_m), -1)
+        distance_m[k] = math.sqrt(nearest_sq)
+        plane_m[k] = min(distance_m[k], plane_distance(
+            x, y, z, place, normals[rows[k]], motion, target, target_normals, min_agreement))
 
 
 @njit()

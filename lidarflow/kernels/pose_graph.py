@@ -67,13 +67,13 @@ def motions_of(variables, points, rows, motions):
 
 
 @njit()
-def shift(variables, factors, by, sign):
-    """Add `sign` times a vector `by` (3,) to the positions of variables, targets and ties."""
+def recentre(variables, factors, origin):
+    """Take a new origin (3,) from the positions of variables, targets and ties."""
     for i in range(len(variables)):
         for k in range(3):
-            variables[i, 4 + k] += sign * by[k]
-            factors.targets[i, k] += sign * by[k]
-            factors.ties[i, 4 + k] += sign * by[k]
+            variables[i, 4 + k] -= origin[k]
+            factors.targets[i, k] -= origin[k]
+            factors.ties[i, 4 + k] -= origin[k]
 
 
 @njit()
