@@ -29,6 +29,7 @@ from lidarflow.lidar.attribution import WORLD, Attribution, Search
 from lidarflow.lidar.matching import Matches
 from lidarflow.lidar.mesh import Mesh
 from lidarflow.lidar.tracking import Tracks
+from lidarflow.rows import lengths
 from lidarflow.solve import solve
 from lidarflow.stopwatch import Stopwatch
 from lidarflow.types import FlowResult, Scan, ScanPair, as_scan
@@ -312,12 +313,14 @@ def _dense(
     """
     motions, moved = by_world
     has_own = owner != WORLD
-    motions[has_own] = by_group[owner[has_own]]
+    rows = np.flatnonzero(has_own)
+    motions[rows] = by_group.take(owner[rows], axis=0)
     for part in parts:
         rows = np.flatnonzero(part.graph.variable >= 0)
-        motions[rows] = part.motions[part.graph.variable[rows]]
+        motions[rows] = part.motions.take(part.graph.variable[rows], axis=0)
         has_own[rows] = True
-    moved[has_own] = pose.apply(motions[has_own], points[has_own])
+    rows = np.flatnonzero(has_own)
+    moved[rows] = pose.apply(motions.take(rows, axis=0), points.take(rows, axis=0))
     return motions, moved
 
 
@@ -349,10 +352,11 @@ def _std(
     """
     std_m = found.std_m.copy()
     if config.objects.enabled:
-        own = points[in_graph]
-        by_own_group = pose.apply(by_group[found.owner[in_graph]], own)
-        apart_m = np.linalg.norm(by_own_group - own - flow[in_graph], axis=1)
-        std_m[in_graph] = np.hypot(std_m[in_graph], apart_m)
+        own = np.flatnonzero(in_graph)
+        at = points.take(own, axis=0)
+        by_own_group = pose.apply(by_group.take(found.owner[own], axis=0), at)
+        apart_m = lengths(by_own_group - at - flow.take(own, axis=0))
+        std_m[own] = np.hypot(std_m[own], apart_m)
         return std_m
     rows = graph.rows[solved]
     if len(rows):

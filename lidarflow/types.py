@@ -13,6 +13,7 @@ import numpy as np
 from lidarflow import pose
 from lidarflow.checks import check, check_motion
 from lidarflow.errors import DataError
+from lidarflow.rows import without_gaps
 
 _FILLED_IN: Any = None     # the default of an array that __post_init__ makes in the length of the others
 
@@ -178,10 +179,10 @@ class FlowProblem:
         position = (np.cumsum(kept) - 1).astype(np.int32)
         matched = kept[self.match_index]
         return replace(
-            self, points=self.points[rows], initial=self.initial[rows],
+            self, points=self.points.take(rows, axis=0), initial=self.initial.take(rows, axis=0),
             match_index=position[self.match_index[matched]], match_target=self.match_target[matched],
-            edges=position[self.edges[kept[self.edges[:, 0]]]],
-            component=np.unique(self.component[rows], return_inverse=True)[1].astype(np.int32),
+            edges=position.take(self.edges.compress(kept.take(self.edges[:, 0]), axis=0)),
+            component=without_gaps(self.component[rows]),
             group=self.group[rows] if len(self.group) else self.group)
 
 

@@ -27,9 +27,11 @@ def local_shifts(
     planes (S,) and the root mean square of r before (S,) and of r − n·t after (S,). Where there are fewer
     than `min_planes` planes, or r is less than `min_rms_m`, t is 0.
     """
-    known = np.flatnonzero(np.isfinite(normals).all(axis=1) & np.isfinite(offsets_m))
-    asked, seen = cells.build(points, radius_m), cells.build(points[known], radius_m)
-    planes = np.column_stack([points[known], normals[known], offsets_m[known]])
+    known = np.flatnonzero(np.isfinite(normals[:, 0]) & np.isfinite(offsets_m))
+    planes = np.empty((len(known), 7))
+    planes[:, :3], planes[:, 3:6] = points.take(known, axis=0), normals.take(known, axis=0)
+    planes[:, 6] = offsets_m.take(known)
+    asked, seen = cells.build(points, radius_m), cells.build(planes[:, :3], radius_m)
     return _local_shifts(np.ascontiguousarray(points), asked, planes, seen, min_planes, min_rms_m)
 
 

@@ -14,13 +14,24 @@ from lidarflow.kernels.compiled import njit
 
 def build(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Grid of finite points (N, 3): order (N,), sorted keys (N,), lower corner (3,), cells per axis (3,)."""
-    lower = points.min(axis=0) - cell_m if len(points) else np.zeros(3)
-    upper = points.max(axis=0) if len(points) else np.zeros(3)
-    shape = np.floor((upper - lower) / cell_m).astype(np.int64) + 3
-    x, y, z = np.floor((points - lower) / cell_m).astype(np.int64).T
-    keys = (x * shape[1] + y) * shape[2] + z
+    keys, lower, shape = _keys(np.ascontiguousarray(points, float), float(cell_m))
     order = np.argsort(keys, kind="stable")
     return order, keys[order], lower, shape
+
+
+@njit()
+def _keys(points, cell_m):
+    """The key (N,) of each point's cell, the lower corner of the grid (3,) and its cells per axis (3,)."""
+    lower, upper = np.zeros(3), np.zeros(3)
+    for k in range(3 if len(points) else 0):
+        lower[k], upper[k] = points[:, k].min() - cell_m, points[:, k].max()
+    shape, keys = np.empty(3, np.int64), np.empty(len(points), np.int64)
+    for k in range(3):
+        shape[k] = math.floor((upper[k] - lower[k]) / cell_m) + 3
+    for i in range(len(points)):
+        x, y, z = cell_of(points[i], lower, cell_m)
+        keys[i] = (x * shape[1] + y) * shape[2] + z
+    return keys, lower, shape
 
 
 def first_per_voxel(points: np.ndarray, voxel_m: float) -> np.ndarray:

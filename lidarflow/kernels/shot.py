@@ -39,7 +39,8 @@ class Support(NamedTuple):
 def support(surface: np.ndarray, normals: np.ndarray, radius_m: float) -> Support:
     """The points (S, 3) of a surface and its normals (S, 3), to be seen within `radius_m` of keypoints."""
     order, keys, lower, shape = grid.build(surface, radius_m)
-    return Support(surface[order], normals[order], keys, lower, shape, radius_m)
+    return Support(
+        surface.take(order, axis=0), normals.take(order, axis=0), keys, lower, shape, radius_m)
 
 
 def describe(keypoints: np.ndarray, seen: Support, min_neighbours: int) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ from lidarflow.lidar.body import Body, near_rows
 from lidarflow.lidar.evidence import tolerance
 from lidarflow.lidar.surface import CAP_M, misfit_after
 from lidarflow.lidar.view import View
+from lidarflow.rows import lengths, mean, median
 
 _GROUND_RADIUS_M = 10.0
 _MIN_GROUND_POINTS = 20
@@ -56,9 +57,9 @@ def matches_agree(view: View, body: Body, config: ObjectsConfig) -> bool:
 
 def _shifted(view: View, body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The body's points (K, 3), where they go (K, 3), and their mean shift (3,)."""
-    points = view.points[body.rows]
+    points = view.points.take(body.rows, axis=0)
     moved = pose.apply(body.over_ground, points)
-    return points, moved, (moved - points).mean(axis=0)
+    return points, moved, mean(moved - points)
 
 
 def _clearance(view: View, points: np.ndarray) -> float:
@@ -67,7 +68,7 @@ def _clearance(view: View, points: np.ndarray) -> float:
     heights = ground_plane.heights(view.ground, lowest[0], lowest[1], _GROUND_RADIUS_M)
     if len(heights) < _MIN_GROUND_POINTS:
         return 0.0
-    return float(lowest[2] - np.median(heights))
+    return float(lowest[2] - median(heights))
 
 
 def _shape_ratio(view: View, body: Body, moved: np.ndarray) -> float:
@@ -104,9 +105,9 @@ def _observability(view: View, body: Body, shift: np.ndarray) -> float:
 
     A wall explains any motion along itself, so that none is to be believed (the aperture problem).
     """
-    normals = view.source.normals[body.rows]
-    normals = normals[np.isfinite(normals).all(axis=1)]
-    return float(((normals @ (shift / np.linalg.norm(shift))) ** 2).mean()) if len(normals) else 0.0
+    cosines = view.source.normals.take(body.rows, axis=0) @ (shift / np.linalg.norm(shift))
+    cosines = cosines[np.isfinite(cosines)]
+    return float((cosines**2).mean()) if len(cosines) else 0.0
 
 
 def _left_and_arrived(view: View, body: Body, moved: np.ndarray) -> tuple[float, float]:
@@ -124,6 +125,6 @@ def _should_show(
     view: View, body: Body, moved: np.ndarray, shift: np.ndarray, config: ObjectsConfig
 ) -> float:
     """Share of the body whose surface the motion shifts by clearly more than explained points may be off."""
-    normals = view.source.normals[body.rows]
-    away_m = np.abs(np.where(np.isfinite(normals), normals, 0.0) @ shift)
-    return float((away_m > _CLEARLY_OFF * tolerance(np.linalg.norm(moved, axis=1), config)).mean())
+    # Where there is no normal, no shift of the surface is told: NaN is not more than anything.
+    away_m = np.abs(view.source.normals.take(body.rows, axis=0) @ shift)
+    return float((away_m > _CLEARLY_OFF * tolerance(lengths(moved), config)).mean())

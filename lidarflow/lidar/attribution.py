@@ -134,9 +134,9 @@ def _std(
 ) -> np.ndarray:
     """Standard deviation (N,) in metres of where its motion puts each point; the world's, or its object's."""
     std_m = uncertainty.of_world(view, np.flatnonzero(owner[rows] == WORLD), pose.apply(ego_motion, points))
-    for index, body in enumerate(bodies):
-        mine = owner == index
-        moved = pose.apply(body.over_ground @ ego_motion, points[mine])
+    for body in bodies:
+        mine = rows[body.rows]
+        moved = pose.apply(body.over_ground @ ego_motion, points.take(mine, axis=0))
         # An object's motion is found after ego-motion, but fitted to the target itself: its error is its own.
         std_m[mine] = uncertainty.of_body(view, body, moved, config.objects.along_ground)
     return std_m

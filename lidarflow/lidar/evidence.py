@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarflow.config import ObjectsConfig
 from lidarflow.kernels import directions
+from lidarflow.rows import lengths
 
 _MAX_ANGLE_RAD = np.radians(1.5)
 _MIN_DIRECTIONS = 2
@@ -34,7 +35,8 @@ def gather(
     They are explained up to `tolerance_m` (N,). Metres, both clouds in the sensor frame of `other`.
     """
     far = np.flatnonzero(left_m > tolerance_m)
-    towards = points[far] / np.maximum(np.linalg.norm(points[far], axis=1), 1e-6)[:, None]
+    towards = points.take(far, axis=0)
+    towards /= np.maximum(lengths(towards), 1e-6)[:, None]
     seen = directions.looked_at(towards, other, _MAX_ANGLE_RAD, _MIN_DIRECTIONS)
     unexplained, blind = np.zeros((2, len(points)), bool)
     unexplained[far[seen]] = True

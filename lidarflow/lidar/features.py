@@ -59,7 +59,7 @@ class Features(Masks):
     @property
     def surface(self) -> np.ndarray:
         """Thinned non-ground points (S, 3), metres."""
-        return self.cloud.upright.points[self.cloud.upright.thinned]
+        return self.cloud.upright.points.take(self.cloud.upright.thinned, axis=0)
 
 
 def masks(scan: Scan, config: Config) -> Masks:
@@ -82,10 +82,10 @@ def extract(scan: Scan, config: Config, beside: Aside | None = None) -> Features
 
 
 def _cloud(points: np.ndarray, seen: Masks, config: Config) -> Cloud:
-    upright = points[seen.standing]
+    upright = points.compress(seen.standing, axis=0)
     return Cloud(
         Surface.of(upright, config.shot.surface_voxel_m, config.normals.radius_m),
-        tree.build(points[seen.usable & seen.ground]))
+        tree.build(points.compress(seen.usable & seen.ground, axis=0)))
 
 
 def _keypoints(seen: Masks, cloud: "Future[Cloud]", config: Config) -> Keypoints:

@@ -11,6 +11,7 @@ from lidarflow.kernels import graphs
 from lidarflow.lidar.keypoints import Keypoints
 from lidarflow.lidar.matching import Matches
 from lidarflow.lidar.mesh import Mesh
+from lidarflow.rows import without_gaps
 from lidarflow.types import FlowProblem
 
 # The start values (N, 4, 4) of points (N, 3).
@@ -37,13 +38,13 @@ def build(points: np.ndarray, mesh: Mesh, thinning_m: float) -> Graph:
     Points (N, 3) without a mesh neighbour are left out.
     """
     variable, rows = _variables(points, mesh, thinning_m)
-    edges = variable[mesh.edges]
+    edges = variable.take(mesh.edges)
     if thinning_m:
         edges = np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1)
         edges = np.unique(edges, axis=0)
     problem = FlowProblem(
-        points[rows], np.broadcast_to(pose.identity(), (len(rows), 4, 4)), np.empty(0, np.int32),
-        np.empty((0, 3)), edges, _renumbered(mesh.component[rows]))
+        points.take(rows, axis=0), np.broadcast_to(pose.identity(), (len(rows), 4, 4)), np.empty(0, np.int32),
+        np.empty((0, 3)), edges, without_gaps(mesh.component[rows]))
     return Graph(problem, variable, rows)
 
 
@@ -60,7 +61,7 @@ def matches(
     has_variable = np.zeros(len(graph.variable), bool)
     has_variable[graph.rows] = True
     eligible = np.flatnonzero(has_variable[source.row])
-    points = source.points[eligible]
+    points = source.points.take(eligible, axis=0)
     return Matches(source, eligible, pose.apply(start_at(points), points), target, dt_s, config)
 
 
@@ -102,7 +103,7 @@ def tied(
     motions = np.concatenate([ego_motion[None], object_motions])
     group = (owners(graph, object_id)[kept] + 1).astype(np.int32)   # group 0 is the static world
     part = graph.problem.part(np.flatnonzero(kept))
-    reduced = replace(part, initial=motions[group], group=group, group_motions=motions)
+    reduced = replace(part, initial=motions.take(group, axis=0), group=group, group_motions=motions)
     position = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
     rows = np.flatnonzero(graph.variable >= 0)
     variable = np.full(len(graph.variable), -1, np.int32)
@@ -134,10 +135,3 @@ def _variables(points: np.ndarray, mesh: Mesh, thinning_m: float) -> tuple[np.nd
     rank = np.argsort(np.argsort(first, kind="stable"), kind="stable")
     variable[rows] = rank[member.ravel()]
     return variable, rows[np.sort(first)]
-
-
-def _renumbered(component: np.ndarray) -> np.ndarray:
-    """Components (M,) int32 without gaps between their numbers, in the same order."""
-    is_there = np.zeros(component.max(initial=-1) + 1, bool)
-    is_there[component] = True
-    return (np.cumsum(is_there, dtype=np.int32) - np.int32(1))[component]

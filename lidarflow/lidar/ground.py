@@ -6,6 +6,7 @@ import numpy as np
 
 from lidarflow.config import GroundConfig
 from lidarflow.kernels import ground_level
+from lidarflow.rows import median
 from lidarflow.silence import silenced
 
 _PATCHWORK_HEIGHT_M = 1.723   # the height Patchwork++ is tuned for; clouds are shifted to it
@@ -60,7 +61,7 @@ def detect(points: np.ndarray, kept: np.ndarray, config: GroundConfig) -> Ground
     is_filled = ground_level.is_level(around, points, others, _FILL_NEIGHBOURS, config.fill_height_m)
     ground.mask[others[is_filled]] = True
     others = others[~is_filled]
-    low = others[points[others, 2] < np.median(around.points[:, 2]) - _REFLECTION_DEPTH_M]
+    low = others[points[others, 2] < median(around.points[:, 2]) - _REFLECTION_DEPTH_M]
     level = ground_level.around(around, points, low, 1, np.inf)
     ground.reflection[low] = points[low, 2] < level - _REFLECTION_DEPTH_M
     return ground

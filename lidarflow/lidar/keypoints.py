@@ -29,8 +29,9 @@ class Keypoints:
         """Those of a surface whose points are `rows` (N,) of a scan."""
         chosen = grid.first_per_voxel(surface.points, config.matching.keypoint_voxel_m)
         seen = shot.support(
-            surface.points[surface.thinned], surface.normals[surface.thinned], config.shot.radius_m)
-        return cls(rows[chosen], surface.points[chosen], seen, config.shot.min_neighbours)
+            surface.points.take(surface.thinned, axis=0), surface.normals.take(surface.thinned, axis=0),
+            config.shot.radius_m)
+        return cls(rows[chosen], surface.points.take(chosen, axis=0), seen, config.shot.min_neighbours)
 
     @cached_property
     def tree(self) -> Tree:

@@ -11,6 +11,7 @@ from lidarflow.kernels import neighbours, tree
 from lidarflow.kernels.matching import Described
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.keypoints import Keypoints
+from lidarflow.rows import lengths
 
 _UNKNOWN, _NONE = -2, -1
 _ROUNDING = 1e-9
@@ -34,7 +35,7 @@ def match(
     ends = rivals(matched.points)
     back, _, _ = kernel.best_in_gate(matched, ends, gate_m, config.rival_radius_m)
     returned = np.append(ends.points, np.full((1, 3), np.inf), axis=0)[back[of_query]]
-    mutual = np.linalg.norm(returned - queries.points[query], axis=1) <= config.mutual_radius_m
+    mutual = lengths(returned - queries.points[query]) <= config.mutual_radius_m
     return query[mutual], best[query[mutual]]
 
 
@@ -64,7 +65,10 @@ class Matches:
 
     def of(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Those of `rows` (R,) of the source scan that have a match, ascending (M,), and its place (M, 3)."""
-        asked = np.flatnonzero(np.isin(self._row, rows))
+        place = np.searchsorted(self._row, rows)
+        is_asked = np.zeros(len(self._row), bool)
+        is_asked[place[np.append(self._row, -1)[place] == rows]] = True
+        asked = np.flatnonzero(is_asked)
         new = asked[self._found[asked] == _UNKNOWN]
         if len(new):
             self._look_for(new)

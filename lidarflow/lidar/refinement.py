@@ -16,6 +16,7 @@ from lidarflow.kernels import neighbours, tree, triangles
 from lidarflow.kernels.tree import Tree
 from lidarflow.kernels.triangles import Triangles
 from lidarflow.lidar.mesh import Mesh
+from lidarflow.rows import lengths
 from lidarflow.types import FlowProblem
 
 _TOLERANCE = 1e-2  # a gain smaller than this share ends a solution
@@ -46,10 +47,10 @@ class Surface:
         """
         near = np.zeros(len(points), bool)
         near[rows[neighbours.near_rows(upright, tree.build(places), _MARGIN_M)]] = True
-        a, b, c = mesh.triangles.T
-        kept = mesh.triangles[near[a] | near[b] | near[c]]
+        a, b, c = near.take(mesh.triangles.T)
+        kept = mesh.triangles.compress(a | b | c, axis=0)
         near[kept] = False
-        return cls(triangles.build(points[kept]), tree.build(points[near]))
+        return cls(triangles.build(points.take(kept, axis=0)), tree.build(points.compress(near, axis=0)))
 
     def nearest(self, points: np.ndarray, reach_m: float) -> np.ndarray:
         """Nearest places (N, 3) on the surface to points (N, 3), metres; NaN where none is within reach."""
@@ -70,10 +71,10 @@ def refined(
     for _ in range(config.rounds):
         if len(rows) == 0:
             break
-        part = problem.part(rows)
+        part = problem if len(rows) == len(problem.points) else problem.part(rows)
         motions[rows], *_ = solve(rematched(part, motions[rows], surface, config.reach_m), settings)
         by_group = pose.apply(part.group_motions[part.group], part.points)
-        apart_m = np.linalg.norm(pose.apply(motions[rows], part.points) - by_group, axis=1)
+        apart_m = lengths(pose.apply(motions[rows], part.points) - by_group)
         limbs = np.unique(part.component[apart_m > config.tie_truncation])
         rows = rows[np.isin(part.component, limbs)]
     return motions
@@ -112,6 +113,6 @@ def wanted(problem: FlowProblem, config: RefineConfig) -> np.ndarray:
         return np.zeros(len(order), bool)
     ordered = problem.points[order]
     size_m = np.maximum.reduceat(ordered, first) - np.minimum.reduceat(ordered, first)
-    nearest_m = np.minimum.reduceat(np.linalg.norm(ordered, axis=1), first)
+    nearest_m = np.minimum.reduceat(lengths(ordered), first)
     small = (size_m <= config.max_size_m).all(axis=1) & (nearest_m <= config.max_range_m)
     return small[problem.component]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarflow.kernels import rings as kernel
+from lidarflow.rows import median
 
 _MIN_RINGS, _MAX_RINGS = 8, 256
 _MIN_POINTS_PER_RING = 50
@@ -40,7 +41,7 @@ def recover(points: np.ndarray) -> Rings | None:
     if len(rows) < _MIN_RINGS * _MIN_POINTS_PER_RING:
         return None
     x, y, z = points.T
-    azimuth, pitch = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))[rows]
+    azimuth, pitch = np.arctan2(y, x), np.arctan2(z, np.sqrt(x * x + y * y))[rows]
     found = _from_file_order(azimuth[rows], pitch)
     if found is None:
         found = _from_pitch(pitch)
@@ -54,12 +55,12 @@ def recover(points: np.ndarray) -> Rings | None:
 def _from_file_order(azimuth: np.ndarray, pitch: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Lasers (P,) and spacing of a file of one revolution after another (KITTI, row-major images)."""
     step = kernel.steps(azimuth)
-    direction, step_size = np.sign(_median(step)), np.abs(step)
+    direction, step_size = np.sign(median(step)), np.abs(step)
     if direction == 0 or np.count_nonzero(step_size < _MAX_STEP_RAD) / len(step) < 0.9:
         return None
     # Half a step before the first point, so that a ring that starts beside it starts behind the cut. A high
     # ring may see one house, and no cut.
-    starts = kernel.cuts(azimuth, direction, 0.5 * _median(step_size), _MAX_STEP_RAD)
+    starts = kernel.cuts(azimuth, direction, 0.5 * median(step_size), _MAX_STEP_RAD)
     # The cut is crossed more than once where azimuth jitters there: short pieces belong to their neighbour.
     starts = np.concatenate([[0], starts])
     starts = starts[np.diff(starts, append=len(azimuth)) >= _MIN_POINTS_PER_RING]
@@ -108,17 +109,10 @@ def _lasers(pitch: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, float] |
     from_highest = np.argsort(-middle, kind="stable")
     laser = np.empty(len(counts), np.int32)
     laser[from_highest] = np.arange(len(counts), dtype=np.int32)
-    median = (0.5 * (middle + next_to_middle))[from_highest]
-    return laser, float(np.median(np.abs(np.diff(median))))
+    of_ring = (0.5 * (middle + next_to_middle))[from_highest]
+    return laser, median(np.abs(np.diff(of_ring)))
 
 
 def _rank(bounds: np.ndarray, share: float) -> np.ndarray:
     """Index of the entry at `share` of each sorted segment [bounds[r], bounds[r+1])."""
     return (bounds[:-1] + share * (bounds[1:] - bounds[:-1] - 1)).astype(np.int64)
-
-
-def _median(values: np.ndarray) -> float:
-    """As np.median of numbers none of which is NaN: looking for those takes it longer than the rest."""
-    half = len(values) // 2
-    parted = np.partition(values, half)
-    return float(parted[half] if len(values) % 2 else 0.5 * (parted[:half].max() + parted[half]))

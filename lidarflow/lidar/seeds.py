@@ -8,6 +8,7 @@ from lidarflow.config import ObjectsConfig
 from lidarflow.kernels import coherence, links, neighbours
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.view import View
+from lidarflow.rows import lengths
 
 MIN_SEEDS = 5            # a cluster with fewer is none
 _LINK_M = 0.7
@@ -64,7 +65,8 @@ def _left_behind(view: View) -> np.ndarray:
     if len(unexplained) == 0:
         return unexplained
     marks = np.column_stack([view.evidence.unexplained, ~view.evidence.blind])
-    around = neighbours.counts_around(view.source.tree, marks, view.points[unexplained], _NEIGHBOURHOOD_M)
+    around = neighbours.counts_around(
+        view.source.tree, marks, view.points.take(unexplained, axis=0), _NEIGHBOURHOOD_M)
     among_unexplained, among_all = around.T
     return unexplained[(among_unexplained >= _LEFT_POINTS) & (among_unexplained >= _LEFT_SHARE * among_all)]
 
@@ -74,11 +76,11 @@ def _shifted(view: View, config: ObjectsConfig) -> tuple[np.ndarray, np.ndarray]
     rows = view.source.thinned
     agrees = view.at_rest.within(_NEIGHBOURHOOD_M)[rows]
     planes, offsets_m = np.full((len(rows), 3), np.nan), np.full(len(rows), np.nan)
-    planes[agrees] = view.upright.normals[view.at_rest.row[rows[agrees]]]
+    planes[agrees] = view.upright.normals.take(view.at_rest.row[rows[agrees]], axis=0)
     offsets_m[agrees] = view.at_rest.offset_m[rows[agrees]]
     shift, count, before_m, after_m = coherence.local_shifts(
-        view.points[rows], planes, offsets_m, _NEIGHBOURHOOD_M, _MIN_PLANES, _MIN_RMS_M)
+        view.points.take(rows, axis=0), planes, offsets_m, _NEIGHBOURHOOD_M, _MIN_PLANES, _MIN_RMS_M)
     explained = after_m**2 <= (1.0 - _MIN_COHERENCE) * before_m**2
     shifted = (count >= _MIN_PLANES) & (before_m >= _MIN_RMS_M) & explained
-    shifted &= np.linalg.norm(shift, axis=1) >= config.min_shift_m
+    shifted &= lengths(shift) >= config.min_shift_m
     return rows[shifted], shift[shifted]

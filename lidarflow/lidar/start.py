@@ -3,6 +3,7 @@
 import numpy as np
 
 from lidarflow.kernels import neighbours, tree
+from lidarflow.rows import are_finite
 from lidarflow.types import FlowResult
 
 _MAX_CARRY_M = 1.0
@@ -18,7 +19,7 @@ def carried(
     """
     start = np.tile(ego_motion, (len(points), 1, 1))
     known = np.flatnonzero(previous.valid & previous.in_graph)
-    here = np.flatnonzero(np.isfinite(points).all(axis=1))
+    here = np.flatnonzero(are_finite(points))
     if len(known) == 0 or len(here) == 0:
         return start
     arrived = previous_points[known] + previous.flow[known]

@@ -36,7 +36,8 @@ class Surface:
         """
         thinned = grid.first_per_voxel(points, voxel_m) if voxel_m else np.arange(len(points))
         return cls(
-            points, normals.estimate(points, points[thinned], radius_m), thinned, tree.build(points))
+            points, normals.estimate(points, points.take(thinned, axis=0), radius_m), thinned,
+            tree.build(points))
 
     def moved(self, motion: np.ndarray) -> "Surface":
         """The same surface after a motion (4, 4)."""

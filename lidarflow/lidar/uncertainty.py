@@ -8,6 +8,7 @@ from lidarflow.kernels import deviation, grid, neighbours
 from lidarflow.lidar.body import Body
 from lidarflow.lidar.surface import CAP_M, Counterparts, counterparts
 from lidarflow.lidar.view import View
+from lidarflow.rows import lengths, mean, median
 from lidarflow.types import FlowProblem
 
 _CELL_M = 0.5            # planes within one cell err together and count as one
@@ -32,7 +33,7 @@ def of_world(view: View, still: np.ndarray, moved: np.ndarray) -> np.ndarray:
     thinned = np.zeros(len(view.points), bool)
     thinned[view.source.thinned] = True
     rows = still[thinned[still]]
-    at, normals, off_m = _planes(view, view.points[rows], view.at_rest[rows])
+    at, normals, off_m = _planes(view, view.points.take(rows, axis=0), view.at_rest[rows])
     ground_at, ground_off_m = _ground(view)
     at, off_m = np.concatenate([at, ground_at]), np.concatenate([off_m, ground_off_m])
     normals = np.concatenate([normals, np.tile([0.0, 0.0, 1.0], (len(ground_at), 1))])
@@ -41,8 +42,8 @@ def of_world(view: View, still: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 def of_body(view: View, body: Body, moved: np.ndarray, along_ground: float) -> np.ndarray:
     """Standard deviation (K,) in metres of points `moved` (K, 3) with a body, target frame."""
-    there = pose.apply(body.over_ground, view.points[body.rows])
-    turned = pose.turn(body.over_ground, view.source.normals[body.rows])
+    there = pose.apply(body.over_ground, view.points.take(body.rows, axis=0))
+    turned = pose.turn(body.over_ground, view.source.normals.take(body.rows, axis=0))
     at, normals, off_m = _planes(view, there, counterparts(there, turned, view.upright, CAP_M))
     upright = np.tile([[0.0, 0.0, 1.0]], (1 if along_ground > 0 else 0, 1))
     return _std(moved, at, normals, off_m, upright)
@@ -53,13 +54,14 @@ def _planes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The points (K, 3) that meet a plane, of those given, its normals (K, 3), and how far off it is (K,)."""
     met = found.within(CAP_M)
-    return points[met], view.upright.normals[found.row[met]], found.offset_m[met]
+    return (points.compress(met, axis=0), view.upright.normals.take(found.row[met], axis=0),
+            found.offset_m[met])
 
 
 def _ground(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Ground points (K, 3) of the target, one per cell, and how far over the source's they lie (K,)."""
     ground = view.ground.points
-    ground = ground[grid.first_per_voxel(ground, _GROUND_CELL_M)]
+    ground = ground.take(grid.first_per_voxel(ground, _GROUND_CELL_M), axis=0)
     _, row = neighbours.query(view.source_ground, ground, _CELL_M)
     ground, row = ground[row >= 0], row[row >= 0]
     height_m = np.empty(len(view.source_ground.rows))
@@ -75,12 +77,12 @@ def _std(
     Its covariance is (Σ JᵀJ / (n s²) + prior)⁻¹, where J is the row [x × n, n] of a plane at x, s its
     standard deviation over the fit, n the planes in its cell. Directions `held` (H, 3) count as known.
     """
-    centre = at.mean(axis=0) if len(at) else np.zeros(3)
+    centre = mean(at) if len(at) else np.zeros(3)
     information = np.diag([_PRIOR_STD_RAD**-2] * 3 + [_PRIOR_STD_M**-2] * 3)
     if len(at):
         size = np.abs(off_m)
-        kept = size <= _TRIMMED * max(float(np.median(size)), _LEAST_STD_M)
-        at, normals, off_m = at[kept], normals[kept], off_m[kept]
+        kept = size <= _TRIMMED * max(median(size), _LEAST_STD_M)
+        at, normals, off_m = at.compress(kept, axis=0), normals.compress(kept, axis=0), off_m[kept]
         variance = max(float((off_m**2).mean()), _LEAST_STD_M**2)
         cell, count = grid.voxels(at - centre, _CELL_M)
         information += deviation.information(at, normals, centre, 1.0 / (count[cell] * variance))
@@ -98,7 +100,7 @@ def of_matches(problem: FlowProblem, motions: np.ndarray, truncation_m: float) -
     the reach of one: matches nearer to each other than that err together. NaN without an inlier.
     """
     at, target = problem.points[problem.match_index], problem.match_target
-    off_m = np.linalg.norm(pose.apply(motions[problem.match_index], at) - target, axis=1)
+    off_m = lengths(pose.apply(motions[problem.match_index], at) - target)
     kept = off_m <= truncation_m
     component = problem.component[problem.match_index[kept]]
     # Components far apart along a fourth axis share one tree.

@@ -14,6 +14,7 @@ from lidarflow.kernels import neighbours, tree
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.evidence import Evidence, gather, tolerance
 from lidarflow.lidar.surface import CAP_M, Cloud, Counterparts, Misfit, Surface, counterparts, misfit_after
+from lidarflow.rows import lengths
 
 MatchFinder = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 _STANDS_OUT_M = 2.0 * CAP_M   # planes are looked for up to here
@@ -68,7 +69,7 @@ def no_matches(_rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def look(source: Cloud, target: Cloud, config: ObjectsConfig) -> View:
     """The view of a pair without matches, all in the target's sensor frame after ego-motion."""
     points, upright = source.upright.points, target.upright
-    tolerance_m = tolerance(np.linalg.norm(points, axis=1), config)
+    tolerance_m = tolerance(lengths(points), config)
     farthest_m = float(tolerance_m.max(initial=_STANDS_OUT_M))
     at_rest = counterparts(points, source.upright.normals, upright, farthest_m)
     left_m = neighbours.nearest_m(target.ground, points, at_rest.distance_m, farthest_m)
@@ -76,14 +77,14 @@ def look(source: Cloud, target: Cloud, config: ObjectsConfig) -> View:
     on_plane = at_rest.within(_STANDS_OUT_M)
     plane_m = np.where(on_plane, np.minimum(np.abs(at_rest.offset_m), capped_m), capped_m)
 
-    near_m = tolerance(np.linalg.norm(upright.points, axis=1), config)
+    near_m = tolerance(lengths(upright.points), config)
     was_there = np.zeros(len(near_m), bool)
     met = np.flatnonzero(at_rest.row >= 0)
     was_there[at_rest.row[met[at_rest.distance_m[met] <= near_m[at_rest.row[met]]]]] = True
     for surroundings in (source.upright.tree, source.ground):
         gone = np.flatnonzero(~was_there)
-        was_there[gone] = neighbours.any_within(surroundings, upright.points[gone], near_m[gone])
-    newcomers = upright.points[~was_there]
+        was_there[gone] = neighbours.any_within(surroundings, upright.points.take(gone, axis=0), near_m[gone])
+    newcomers = upright.points.compress(~was_there, axis=0)
     everything = np.concatenate([upright.points, target.ground.points])
     return View(
         source.upright, tolerance_m, gather(points, left_m, tolerance_m, everything),

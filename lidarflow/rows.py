@@ -1,0 +1,37 @@
+"""What is asked of the rows of tall arrays, by columns: numpy takes several times as long along short rows.
+
+Where it counts, rows are gathered with `take` and `compress`, in a quarter of the time of an index.
+"""
+
+import numpy as np
+
+
+def lengths(vectors: np.ndarray) -> np.ndarray:
+    """Euclidean lengths (N,) of vectors (N, 3)."""
+    x, y, z = vectors.T
+    return np.sqrt(x * x + y * y + z * z)
+
+
+def are_finite(vectors: np.ndarray) -> np.ndarray:
+    """Whether (N,) vectors (N, 3) are finite, all three of their numbers."""
+    x, y, z = vectors.T
+    return np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+
+
+def mean(vectors: np.ndarray) -> np.ndarray:
+    """The mean (3,) of vectors (N, 3), at least one."""
+    return np.einsum("ij->j", vectors) / len(vectors)
+
+
+def median(values: np.ndarray) -> float:
+    """As np.median of values (N,), at least one, none of them NaN: to look for those takes it longer."""
+    half = len(values) // 2
+    parted = np.partition(values, half)
+    return float(parted[half] if len(values) % 2 else 0.5 * (parted[:half].max() + parted[half]))
+
+
+def without_gaps(numbers: np.ndarray) -> np.ndarray:
+    """Numbers (N,) int32, from 0 on, as (N,) int32 in the same order but without those that none has."""
+    is_there = np.zeros(numbers.max(initial=-1) + 1, bool)
+    is_there[numbers] = True
+    return (np.cumsum(is_there, dtype=np.int32) - np.int32(1)).take(numbers)

@@ -1,0 +1,38 @@
+"""Arithmetic by columns says what numpy says along rows."""
+
+import numpy as np
+import pytest
+
+from lidarflow import rows
+
+
+@pytest.fixture
+def vectors():
+    return np.random.default_rng(3).normal(size=(501, 3))
+
+
+def test_lengths_are_euclidean(vectors):
+    np.testing.assert_allclose(rows.lengths(vectors), np.linalg.norm(vectors, axis=1), rtol=1e-14)
+    assert rows.lengths(np.empty((0, 3))).shape == (0,)
+
+
+def test_one_number_that_is_not_finite_makes_a_vector_not_finite(vectors):
+    vectors[3, 0], vectors[5, 1], vectors[7, 2] = np.nan, np.inf, -np.inf
+    assert np.flatnonzero(~rows.are_finite(vectors)).tolist() == [3, 5, 7]
+
+
+def test_mean_is_that_of_every_column(vectors):
+    np.testing.assert_allclose(rows.mean(vectors), vectors.mean(axis=0), atol=1e-15)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 11])
+def test_median_is_that_of_numpy(vectors, count):
+    values = vectors[:count, 0]
+    assert rows.median(values) == np.median(values)
+
+
+def test_numbers_lose_their_gaps_and_keep_their_order():
+    numbers = np.array([7, 2, 2, 9, 0], np.int32)
+    found = rows.without_gaps(numbers)
+    assert found.tolist() == [2, 1, 1, 3, 0] and found.dtype == np.int32
+    assert rows.without_gaps(np.empty(0, np.int32)).shape == (0,)
