@@ -1,4 +1,4 @@
-"""The command line: the only place that prints or exits.
+"""The command line; it and its parts (`*_cli.py`) alone print and exit.
 
 Heavy packages are imported inside the commands, so that --help answers at once.
 """

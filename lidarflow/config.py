@@ -40,7 +40,8 @@ class PreparationConfig:
 class GroundConfig:
     sensor_height_m: float = setting(0.0, "height of the sensor over ground; 0 = estimated per scan", low=0)
     max_height_m: float = setting(
-        0.25, "points higher than this over the ground surface around them are not ground", low=0.02)
+        0.25, "points higher than this over the lowest ground within 2 m are not ground; a slope of one in ten "
+        "is allowed for", low=0.02)
 
     fill_height_m: float = setting(
         0.12, "points within this height of the ground around them are ground as well", low=0)
@@ -56,7 +57,7 @@ class MeshConfig:
     method: str = setting("auto", "scan grid for spinning sensors, tangent planes for other clouds",
                           choices=("auto", "grid", "tangent"))
     max_edge_m: float = setting(
-        0.395, "longest edge: surfaces farther apart than this are never joined", low=0.01)
+        0.395, "longest edge; see max_edge_rings for what is far from a spinning sensor", low=0.01)
     max_edge_rings: float = setting(
         1.25, "longest edge in spacings of a spinning sensor's rings, where those are farther apart than "
         "max_edge_m; 0 = max_edge_m everywhere", low=0)
@@ -86,8 +87,9 @@ class MatchingConfig:
 
 @dataclass(frozen=True, slots=True)
 class GraphConfig:
-    start: str = setting("previous", "start value: the previous pair's motions, or only the ego-motion",
-                         choices=("previous", "ego"))
+    start: str = setting(
+        "previous", "start value, with objects of the search for matches alone: the previous pair's motions, "
+        "or only the ego-motion", choices=("previous", "ego"))
     thinning_m: float = setting(0.0, "one variable per voxel and component instead of one per point; "
                                 "0 = every point", low=0)
     min_matches: int = setting(3, "components with fewer matches keep their start value", low=1)
@@ -136,13 +138,15 @@ class EgoConfig:
     method: str = setting(
         "registration", "what registration begins with in a sequence: the last pair's motion, or KISS-ICP's",
         choices=("registration", "kiss_icp"))
-    refine: bool = setting(True, "false = kiss_icp as it is, without registration")
+    refine: bool = setting(True, "false = kiss_icp (method) as it is, without registration")
     voxel_m: float = setting(
         0.2, "clouds are thinned to this before registration, finer in small places", low=0.02)
 
 
 @dataclass(frozen=True, slots=True)
 class DynamicConfig:
+    """What moves where no objects are looked for (objects.enabled = false)."""
+
     min_speed_m_per_s: float = setting(0.5, "slower residual motion counts as static", low=0)
     smoothing_rounds: int = setting(10, "how often residual motion is averaged over the mesh", low=0)
     min_gain_m: float = setting(
@@ -175,8 +179,8 @@ class ObjectsConfig:
         0.4, "an object's own motion must bring its mean squared plane distance down to this share",
         low=0, high=1)
     max_match_deviation: float = setting(
-        0.6, "how far the median match on an object may be from its motion, as a share of the motion",
-        low=0, high=2)
+        0.6, "how far the median match on an object may be from its motion, as a share of the motion and at "
+        "most 0.3 m", low=0, high=2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -156,7 +156,6 @@ class Prepared:
     not looked for. The graph then has its matches, else none yet, and `matches` finds them. What is
     refined needs the mesh of the target and the scene of limbs; when objects are looked for, what may have
     limbs is refined as part of the world meanwhile. These may still be under way, or None.
-    `by_world` is what the dense answer is for points that move with the world.
     """
 
     pair: ScanPair
@@ -165,7 +164,6 @@ class Prepared:
     ego_motion: np.ndarray
     mesh: Mesh
     target_mesh: "Future[Mesh] | None"
-    by_world: "Future[tuple[np.ndarray, np.ndarray]]"
     scene: "Future[limbs.Scene] | None"
     world_limbs: "Future[limbs.Part] | None"
     tracks: Tracks
@@ -205,7 +203,6 @@ def prepare(
     tracks, search = tracks or Tracks(), None
     if config.objects.enabled and scene:
         world_limbs = beside.begin(_world_limbs, scene, ego_motion)
-    by_world = beside.begin(_by_world, points, ego_motion)
     if config.objects.enabled:
         with timed("features"):
             target.begun_cloud.result()
@@ -221,10 +218,11 @@ def prepare(
         matches = frontend.matches(graph, *keypoints, start_at, pair.dt_s, config.matching)
     if search is None:
         with timed("matching"):
-            graph = frontend.matched(frontend.started(graph, start_at), *matches.of(graph.rows))
+            graph = frontend.matched(
+                frontend.started(graph, start_at), points, *matches.of(np.flatnonzero(graph.variable >= 0)))
     return Prepared(
-        pair, source, target, ego_motion, source_mesh, target_mesh, by_world, scene, world_limbs, tracks,
-        search, graph, matches, timed.seconds)
+        pair, source, target, ego_motion, source_mesh, target_mesh, scene, world_limbs, tracks, search, graph,
+        matches, timed.seconds)
 
 
 def _mesh(scan: Scan, seen: features.Features, config: Config) -> Mesh:
@@ -261,6 +259,7 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
     pair, source, graph, ego_motion = prepared.pair, prepared.source, prepared.graph, prepared.ego_motion
     timed = Stopwatch(dict(prepared.seconds))
     points = pair.source.points
+    by_world = beside.begin(_by_world, points, ego_motion)
     with timed("objects"):
         found = Attribution.none(len(points))
         if prepared.search:
@@ -269,23 +268,21 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
             graph = frontend.focused(graph, found.owner, found.motions, ego_motion)
             # Around objects, matches would say what ego-motion says already.
             moving = np.flatnonzero(found.owner != WORLD)
-            graph = frontend.matched(graph, *prepared.matches.of(moving))
+            graph = frontend.matched(graph, points, *prepared.matches.of(moving))
         by_group = np.concatenate([found.motions, ego_motion[None]])   # WORLD is the last
     with timed("solver"):
         motions, solved, stats = solve(graph.problem, config.solver, config.graph.min_matches)
-        whole = limbs.Part(graph, motions)
+        whole = limbs.Part(graph, motions, solved)
     with timed("refinement"):
-        refined = _refined(prepared, whole, found, config)
+        parts = whole, *_refined(prepared, whole, found, config)
     with timed("dense answer"):
-        is_refined = np.zeros(len(points), bool)
-        for part in refined:
-            is_refined |= part.graph.variable >= 0
-        in_graph = is_refined | (graph.variable >= 0)
-        dense, moved = _dense(points, prepared.by_world.result(), by_group, found.owner, (whole, *refined))
+        dense, moved = _dense(points, by_world.result(), by_group, found.owner, parts)
         flow = moved - points
-        std_m = _std(points, found, graph, motions, solved, in_graph, flow, by_group, config)
-        is_solved = is_refined | np.append(solved, False)[graph.variable]
-        is_solved &= np.isfinite(std_m)     # what let all its matches go rests on none of them
+        std_m = _std(points, found, whole, parts, flow, by_group, config)
+        in_graph = np.zeros(len(points), bool)
+        for part in parts:
+            in_graph |= np.append(part.solved, False)[part.graph.variable]
+        is_solved = in_graph & np.isfinite(std_m)     # what let all its matches go rests on none of them
         is_dynamic = found.owner != WORLD
         if not prepared.search:
             residual_flow = moved - pose.apply(ego_motion, points)
@@ -308,15 +305,16 @@ def _dense(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motions (N, 4, 4) of points (N, 3), and where they go (N, 3).
 
-    Both are filled in where a point does not move `by_world`: it has the motion of its group, by_group
-    (G, 4, 4), unless it is in a part of the graph, whose variables have their own; the last part counts.
+    Both are those `by_world`, which are given away, filled in where a point moves otherwise: it has the
+    motion of its group, by_group (G, 4, 4), unless it is in a part of the graph, whose variables have their
+    own; the last part counts.
     """
     motions, moved = by_world
     has_own = owner != WORLD
     rows = np.flatnonzero(has_own)
     motions[rows] = by_group.take(owner[rows], axis=0)
     for part in parts:
-        rows = np.flatnonzero(part.graph.variable >= 0)
+        rows = part.points
         motions[rows] = part.motions.take(part.graph.variable[rows], axis=0)
         has_own[rows] = True
     rows = np.flatnonzero(has_own)
@@ -342,8 +340,8 @@ def _refined(
 
 
 def _std(
-    points: np.ndarray, found: Attribution, graph: frontend.Graph, motions: np.ndarray, solved: np.ndarray,
-    in_graph: np.ndarray, flow: np.ndarray, by_group: np.ndarray, config: Config,
+    points: np.ndarray, found: Attribution, whole: limbs.Part, parts: tuple[limbs.Part, ...],
+    flow: np.ndarray, by_group: np.ndarray, config: Config,
 ) -> np.ndarray:
     """Standard deviation (N,) of the flow in metres.
 
@@ -352,15 +350,15 @@ def _std(
     """
     std_m = found.std_m.copy()
     if config.objects.enabled:
-        own = np.flatnonzero(in_graph)
+        own = np.unique(np.concatenate([part.points for part in parts]))
         at = points.take(own, axis=0)
         by_own_group = pose.apply(by_group.take(found.owner[own], axis=0), at)
         apart_m = lengths(by_own_group - at - flow.take(own, axis=0))
         std_m[own] = np.hypot(std_m[own], apart_m)
         return std_m
-    rows = graph.rows[solved]
-    if len(rows):
-        std_m[rows] = uncertainties.of_matches(graph.problem, motions, config.solver.truncation_m)[solved]
+    if whole.solved.any():
+        by_matches = uncertainties.of_matches(whole.graph.problem, whole.motions, config.solver.truncation_m)
+        std_m[whole.points] = np.where(whole.solved, by_matches, np.nan)[whole.graph.variable[whole.points]]
     return std_m
 
 

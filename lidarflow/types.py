@@ -245,7 +245,7 @@ class FlowResult:
     flow         (N, 3) float64      metres, total: τ p − p, ego-motion included; NaN where p is NaN
     motions      (N, 4, 4) float64   τ of every point, target_from_source
     valid        (N,) bool           the motion rests on evidence, not on a start value
-    in_graph     (N,) bool           the motion was solved for, not taken from the ego-motion
+    in_graph     (N,) bool           the motion was solved for, not taken from the point's object or the world
     is_dynamic   (N,) bool           moves over ground by itself
     ego_motion   (4, 4) float64      target_from_source of the static world
     stats        SolveStats

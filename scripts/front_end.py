@@ -38,7 +38,7 @@ def evaluate_pair(dataset, index: int, config: settings.Config) -> str:
     matches = frontend.matches(
         graph, source.keypoints, target.keypoints, lambda at: pose.identity(len(at)), pair.dt_s,
         config.matching)
-    graph = frontend.matched(graph, *matches.of(graph.rows)).problem
+    graph = frontend.matched(graph, points, *matches.of(np.flatnonzero(graph.variable >= 0))).problem
     row = [f"{dataset.name} {pair.source.name}", found.method,
            f"{meshed_share(points, kept, found.component):.3f}", str(len(graph.match_index))]
     truth, _ = runner.find_truth(dataset, index, pair)

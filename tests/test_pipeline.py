@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import worlds
 from numpy.testing import assert_allclose
+from scipy.spatial import KDTree
 from shared_data import SHARED, needs_shared
 
-from lidarflow import pose, synthetic
-from lidarflow.config import Config, EgoConfig, ObjectsConfig
+from lidarflow import aside, pipeline, pose, synthetic
+from lidarflow.config import Config, EgoConfig, ObjectsConfig, load
 from lidarflow.datasets import open_dataset
 from lidarflow.datasets.clouds import read_points
 from lidarflow.errors import LidarflowError
@@ -77,6 +78,50 @@ def test_the_motion_of_one_car_is_found(car):
     assert result.is_dynamic[static_graph].mean() <= 0.02
 
 
+def test_a_thing_that_the_next_scan_hides_is_neither_solved_nor_valid():
+    """What is near and small is refined; with nothing of it in reach, nothing says that it stood still."""
+    scans = synthetic.scan_sequence(synthetic.room(rng(3)), synthetic.hdl64e(400), 2, rng(4))
+    pair, config = ScanPair(scans[0][0], scans[1][0]), Config()
+    with aside.Aside() as beside:
+        prepared = pipeline.prepare(pair, config, beside)
+        scene = prepared.scene.result()
+        component = scene.graph.problem.component
+        thing = scene.graph.rows[component == np.bincount(component[scene.wanted]).argmax()]
+        shown, _ = pipeline.explain(prepared, config, beside)
+    there = pose.apply(shown.ego_motion, pair.source.points[thing])
+    gone = KDTree(there).query(pair.target.points)[0] < 1.0
+    hidden = estimate_flow(
+        ScanPair(pair.source, Scan(np.where(gone[:, None], np.nan, pair.target.points))), config)
+    assert len(thing) > 50 and shown.in_graph[thing].all() and shown.valid[thing].all()
+    assert not hidden.in_graph[thing].any() and not hidden.valid[thing].any()
+    assert np.isnan(hidden.std_m[thing]).all()
+
+
+def test_thinning_the_graph_loses_neither_matches_nor_points(car):
+    pair, truth, whole = car
+    thinned = estimate_flow(pair, load(overrides=("objects.enabled=false", "graph.thinning_m=0.2")))
+    assert thinned.stats.variables < 0.6 * whole.stats.variables
+    assert thinned.stats.matches > 0.5 * whole.stats.matches
+    solved, of_whole = thinned.in_graph & thinned.valid, whole.in_graph & whole.valid
+    assert solved.sum() > 0.9 * of_whole.sum() and np.isfinite(thinned.std_m[solved]).all()
+    error_m = flow_error_m(thinned, truth)
+    assert np.median(error_m[truth.is_dynamic]) <= 0.12
+    assert error_m[solved & ~truth.is_dynamic].mean() <= 0.10
+
+
+def test_explaining_a_prepared_pair_twice_gives_the_same(car):
+    pair, _, _ = car
+    config = Config()
+    with aside.Aside() as beside:
+        prepared = pipeline.prepare(pair, config, beside)
+        first, _ = pipeline.explain(prepared, config, beside)
+        second, _ = pipeline.explain(prepared, load(overrides=("objects.min_speed_m_per_s=50",)), beside)
+        third, _ = pipeline.explain(prepared, config, beside)
+    assert first.is_dynamic.any() and not second.is_dynamic.any()
+    assert (second.motions[~second.in_graph] == second.ego_motion).all()
+    np.testing.assert_array_equal(first.motions, third.motions)
+
+
 def test_residual_flow_is_the_car_and_nothing_else(car):
     pair, truth, result = car
     residual_m = np.linalg.norm(result.residual_flow(pair.source.points), axis=1)
@@ -89,10 +134,10 @@ def test_residual_flow_is_the_car_and_nothing_else(car):
 def test_matches_and_stats_are_those_of_the_graph(car):
     pair, _, result = car
     stats = result.stats
-    assert stats.variables == result.in_graph.sum()
+    assert stats.variables >= result.in_graph.sum() > 0.9 * stats.variables
     assert len(result.match_source) == len(result.match_target) == stats.matches > stats.inliers > 500
     source = {row.tobytes() for row in pair.source.points[result.in_graph]}
-    assert all(row.tobytes() in source for row in result.match_source)
+    assert sum(row.tobytes() in source for row in result.match_source) >= stats.inliers
     target = {row.tobytes() for row in pair.target.points}
     assert all(row.tobytes() in target for row in result.match_target)
     assert stats.plain_final_error < stats.plain_initial_error

@@ -86,7 +86,8 @@ def test_what_objects_touch_is_refined_with_them_and_the_rest_as_part_of_the_wor
     scene, ego_motion = scene_of(problem, target), np.eye(4)
     touched = frontend.touched(scene.graph, owner)
     np.testing.assert_array_equal(touched, np.repeat([False, True, True], 16))
-    solved = limbs.Part(replace(scene.graph, variable=np.full(48, -1, np.int32)), np.empty((0, 4, 4)))
+    solved = limbs.Part(
+        replace(scene.graph, variable=np.full(48, -1, np.int32)), np.empty((0, 4, 4)), np.empty(0, bool))
 
     def with_objects(touched: np.ndarray) -> limbs.Part:
         return limbs.of_objects(
@@ -107,10 +108,19 @@ def test_limbs_begin_at_what_was_solved():
     problem = patches((8.0, 1.0))
     scene = replace(scene_of(problem, problem.points), config=load(overrides=("refine.rounds=0",)))
     start = np.broadcast_to(pose.from_translation([0.0, 0.0, 0.2]), (16, 4, 4))
+    solved = limbs.Part(scene.graph, start, np.ones(16, bool))
     found = limbs.of_objects(
-        scene, np.ones(16, bool), limbs.Part(scene.graph, start), np.full(16, -1), np.empty((0, 4, 4)),
-        np.empty(0, bool), np.eye(4))
+        scene, np.ones(16, bool), solved, np.full(16, -1), np.empty((0, 4, 4)), np.empty(0, bool), np.eye(4))
     np.testing.assert_array_equal(found.motions, start)
+    assert not found.solved.any()
+
+
+def test_what_the_next_scan_does_not_show_is_not_solved():
+    problem = patches((8.0, 1.0), (9.0, 1.0))
+    scene = scene_of(problem, problem.points[:16])
+    found = limbs.of_world(scene, np.eye(4))
+    np.testing.assert_array_equal(found.solved, np.repeat([True, False], 16))
+    np.testing.assert_array_equal(found.motions[16:], problem.initial[16:])
 
 
 # ---- where the surface is ---------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ _START_OFF_M = 1.0    # what RANSAC finds is nearer than this: a wider search co
 
 
 class RansacIcp(WholeScan):
-    """One motion by RANSAC on the SHOT matches that our method uses, then robust point-to-plane ICP.
+    """One motion by RANSAC on SHOT matches around unmoved points, then robust point-to-plane ICP.
 
     Point-to-plane has a third of the errors of point-to-point (scripts/baseline_variants.py). No ego-motion
     is used. Without a consensus among the matches the ICP starts wide, at the identity.

@@ -46,7 +46,10 @@ def seems_to_move(view: View, body: Body, dt_s: float, config: ObjectsConfig) ->
 
 
 def matches_agree(view: View, body: Body, config: ObjectsConfig) -> bool:
-    """Whether the body's median descriptor match is nearer to its motion than to rest, along the ground."""
+    """Whether the body's median descriptor match is near to where its motion leads, along the ground.
+
+    It may be off by config.max_match_deviation of the motion, and by CAP_M at most.
+    """
     rows, places = view.matches(body.rows)
     if len(rows) < max(config.min_matches, 1):
         return config.min_matches == 0

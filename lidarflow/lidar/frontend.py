@@ -57,17 +57,23 @@ def matches(
     graph: Graph, source: Keypoints, target: Keypoints, start_at: StartValues, dt_s: float,
     config: MatchingConfig,
 ) -> Matches:
-    """The matches of keypoints that a variable sits at, each sought around where its start value puts it."""
-    has_variable = np.zeros(len(graph.variable), bool)
-    has_variable[graph.rows] = True
-    eligible = np.flatnonzero(has_variable[source.row])
+    """The matches of keypoints that a variable stands for, each sought around where a start value puts it."""
+    eligible = np.flatnonzero(graph.variable[source.row] >= 0)
     points = source.points.take(eligible, axis=0)
     return Matches(source, eligible, pose.apply(start_at(points), points), target, dt_s, config)
 
 
-def matched(graph: Graph, rows: np.ndarray, places: np.ndarray) -> Graph:
-    """The graph with matches: rows (K,) of the source that variables sit at, and their places (K, 3)."""
-    problem = replace(graph.problem, match_index=graph.variable[rows], match_target=places)
+def matched(graph: Graph, points: np.ndarray, rows: np.ndarray, places: np.ndarray) -> Graph:
+    """The graph with matches: rows (K,) of the source's points (N, 3), ascending, and their places (K, 3).
+
+    A variable that stands for several points takes the first of their matches, shifted from that point to
+    where the variable sits, as its start value turns.
+    """
+    variable, first = np.unique(graph.variable[rows], return_index=True)
+    problem = graph.problem
+    aside_m = problem.points[variable] - points[rows[first]]
+    turned = np.einsum("nij,nj->ni", problem.initial[variable, :3, :3], aside_m)
+    problem = replace(problem, match_index=variable, match_target=places[first] + turned)
     return replace(graph, problem=problem)
 
 

@@ -81,7 +81,7 @@ def estimate_sensor_height(points: np.ndarray, rows: np.ndarray) -> float | None
 def _close_to_local_ground(points: np.ndarray, rows: np.ndarray, max_height_m: float) -> np.ndarray:
     """Mask (K,) of the rows (K,) of points at most `max_height_m` over the low ground of their cell.
 
-    A low quantile, not the lowest point, which may be a reflection from under the road.
+    A low quantile, not the lowest point, which may be a reflection from under the road. A cell may slope.
     """
     slope_allowance_m = 0.1 * _CELL_M
     return ground_level.is_low(points, rows, _CELL_M, _LOW_SHARE, max_height_m + slope_allowance_m)

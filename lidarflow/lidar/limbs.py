@@ -18,10 +18,16 @@ from lidarflow.lidar.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Some of a graph's variables, and their motions (M, 4, 4)."""
+    """Some of a graph's variables, their motions (M, 4, 4), and whether matches say so (M,)."""
 
     graph: Graph
     motions: np.ndarray
+    solved: np.ndarray
+
+    @property
+    def points(self) -> np.ndarray:
+        """The rows (P,) of the source scan that a variable of the part stands for."""
+        return np.flatnonzero(self.graph.variable >= 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,13 +55,14 @@ class Scene:
 
     def refined(self, part: Graph, motions: np.ndarray) -> Part:
         """A part of the graph once its `motions` (M, 4, 4) have been drawn to the target."""
+        solved = np.zeros(len(motions), bool)
         if len(motions):
             surface = refinement.Surface.around(
                 pose.apply(motions, part.problem.points), self.points, self.rows, self.tree, self.mesh)
             settings = refinement.solver(self.config.solver, self.config.refine)
-            motions = refinement.refined(
+            motions, solved = refinement.refined(
                 part.problem, motions, surface, self.solve, settings, self.config.refine)
-        return Part(part, motions)
+        return Part(part, motions, solved)
 
 
 def of_world(scene: Scene, ego_motion: np.ndarray) -> Part:
@@ -68,7 +75,8 @@ def of_world(scene: Scene, ego_motion: np.ndarray) -> Part:
 def apart_from(world: Part, graph: Graph, touched: np.ndarray) -> Part:
     """What of the world's part is in no component of the whole `graph` that is `touched` (M,)."""
     kept = np.append(~touched, False)[graph.variable]
-    return Part(replace(world.graph, variable=np.where(kept, world.graph.variable, -1)), world.motions)
+    variable = np.where(kept, world.graph.variable, -1)
+    return Part(replace(world.graph, variable=variable), world.motions, world.solved)
 
 
 def of_objects(

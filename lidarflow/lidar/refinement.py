@@ -60,24 +60,25 @@ class Surface:
 def refined(
     problem: FlowProblem, motions: np.ndarray, surface: Surface, solve: Callable, settings: SolverConfig,
     config: RefineConfig,
-) -> np.ndarray:
-    """Motions (M, 4, 4) of the problem's variables on the surface, from `motions` (M, 4, 4).
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motions (M, 4, 4) of the problem's variables on the surface, from `motions`, and what was solved (M,).
 
     solve(problem, settings) gives motions, what was solved, and more. A thing none of whose points has left
     its group has no limbs that move, and is done.
     """
-    motions = motions.copy()
+    motions, solved = motions.copy(), np.zeros(len(motions), bool)
     rows = np.arange(len(problem.points))
     for _ in range(config.rounds):
         if len(rows) == 0:
             break
         part = problem if len(rows) == len(problem.points) else problem.part(rows)
-        motions[rows], *_ = solve(rematched(part, motions[rows], surface, config.reach_m), settings)
+        motions[rows], solved[rows], *_ = solve(
+            rematched(part, motions[rows], surface, config.reach_m), settings)
         by_group = pose.apply(part.group_motions[part.group], part.points)
         apart_m = lengths(pose.apply(motions[rows], part.points) - by_group)
         limbs = np.unique(part.component[apart_m > config.tie_truncation])
         rows = rows[np.isin(part.component, limbs)]
-    return motions
+    return motions, solved
 
 
 def rematched(problem: FlowProblem, motions: np.ndarray, surface: Surface, reach_m: float) -> FlowProblem:

@@ -131,7 +131,7 @@ def overlap(source: np.ndarray, target: Tree, reach_m: float, target_from_source
 def reproducible(motion: np.ndarray) -> np.ndarray:
     """`motion` (4, 4) with its twist rounded to nanometres and nanoradians.
 
-    Registrations sum in parallel and in no fixed order; without their last digits equal runs give equal
+    Open3D and KISS-ICP sum in parallel and in no fixed order; without their last digits equal runs give equal
     bytes.
     """
     return pose.exp(np.round(pose.log(motion), _REPRODUCIBLE_DECIMALS))
