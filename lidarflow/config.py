@@ -40,8 +40,8 @@ class PreparationConfig:
 class GroundConfig:
     sensor_height_m: float = setting(0.0, "height of the sensor over ground; 0 = estimated per scan", low=0)
     max_height_m: float = setting(
-        0.25, "points higher than this over the lowest ground within 2 m are not ground; a slope of one in ten "
-        "is allowed for", low=0.02)
+        0.25, "points higher than this over the low ground of their cell of 2 m, plus a slope of one in ten, "
+        "are not ground", low=0.02)
 
     fill_height_m: float = setting(
         0.12, "points within this height of the ground around them are ground as well", low=0)
