@@ -281,7 +281,7 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
         std_m = _std(points, found, whole, parts, flow, by_group, config)
         in_graph = np.zeros(len(points), bool)
         for part in parts:
-            in_graph |= np.append(part.solved, False)[part.graph.variable]
+            in_graph |= np.append(part.solved, False).take(part.graph.variable)
         is_solved = in_graph & np.isfinite(std_m)     # what let all its matches go rests on none of them
         is_dynamic = found.owner != WORLD
         if not prepared.search:
@@ -291,7 +291,7 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
                 pair.target.points[prepared.target.usable], pair.dt_s, config.dynamic)
         matches = graph.problem.points[graph.problem.match_index], graph.problem.match_target
         valid = source.ground | found.explained | is_solved
-        object_id = np.append(found.ids, np.int32(-1))[found.owner]
+        object_id = np.append(found.ids, np.int32(-1)).take(found.owner)
         std_m[~valid] = np.nan
     result = FlowResult(
         flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,

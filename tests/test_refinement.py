@@ -129,14 +129,16 @@ def test_the_nearest_place_lies_within_a_triangle_and_else_on_a_point():
     points = np.array([[5.0, 0.0, 0.0], [5.0, 1.0, 0.0], [5.0, 0.0, 1.0], [5.0, 3.0, 0.0], [5.0, 0.0, 9.0]])
     one_triangle = mesh.Mesh(np.array([[0, 1, 2]], np.int32), np.array([[0, 1], [0, 2], [1, 2]], np.int32),
                              np.array([0, 0, 0, 1, 2], np.int32), "grid")
-    surface = refinement.Surface.around(points[:4], points, np.arange(5), tree.build(points), one_triangle)
+    surface = refinement.Surface.around(
+        points[:4], 1.5, points, np.arange(5), tree.build(points), one_triangle)
     asked = np.array([[5.2, 0.25, 0.25], [4.9, 2.9, 0.1], [5.1, -0.3, 0.5]])
     np.testing.assert_allclose(
         surface.nearest(asked, 0.5), [[5.0, 0.25, 0.25], [5.0, 3.0, 0.0], [5.0, 0.0, 0.5]], atol=1e-12)
     assert np.isnan(surface.nearest(asked, 0.1)).all()
     no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(5), "grid")
     others = np.array([0, 2, 3, 4])
-    bare = refinement.Surface.around(points[:4], points, others, tree.build(points[others]), no_triangles)
+    bare = refinement.Surface.around(
+        points[:4], 1.5, points, others, tree.build(points[others]), no_triangles)
     np.testing.assert_allclose(bare.nearest(asked[:1], 0.5), [[5.0, 0.0, 0.0]])
 
 
@@ -146,7 +148,7 @@ def test_places_out_of_reach_say_nothing():
     points[problem.points[:, 2] > 0.9, 0] += 1.0
     no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(16), "grid")
     surface = refinement.Surface.around(
-        problem.points, points, np.arange(16), tree.build(points), no_triangles)
+        problem.points, 1.5, points, np.arange(16), tree.build(points), no_triangles)
     matched = refinement.rematched(problem, problem.initial, surface, 0.3)
     np.testing.assert_array_equal(matched.match_index, np.flatnonzero(problem.points[:, 2] < 0.9))
     np.testing.assert_allclose(matched.match_target, points[matched.match_index])
@@ -157,7 +159,7 @@ def test_a_scan_without_a_point_upright_says_nothing():
     no_triangles = mesh.Mesh(np.empty((0, 3), np.int32), np.empty((0, 2), np.int32), np.arange(4), "grid")
     ground = np.array([[8.0, y, -1.7] for y in range(4)])
     surface = refinement.Surface.around(
-        problem.points, ground, np.empty(0, np.int64), tree.build(np.empty((0, 3))), no_triangles)
+        problem.points, 1.5, ground, np.empty(0, np.int64), tree.build(np.empty((0, 3))), no_triangles)
     assert len(refinement.rematched(problem, problem.initial, surface, 0.3).match_index) == 0
 
 

@@ -107,12 +107,12 @@ def completed(view: View, growth: Growth, free: np.ndarray) -> Growth:
 
 def near_rows(view: View, rows: np.ndarray, radius_m: float) -> np.ndarray:
     """Ascending rows of the view's points within `radius_m` of any of those at `rows` (K,)."""
-    return neighbours.near_rows(view.source.tree, tree.build(view.points[rows]), radius_m)
+    return neighbours.near_rows(view.source.tree, tree.build(view.points.take(rows, axis=0)), radius_m)
 
 
 def _surrounded(view: View, on_body: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Whether (K,) most neighbours of each of `rows` are on the body."""
-    body, points = tree.build(view.points[on_body]), view.points[rows]
+    body, points = tree.build(view.points.compress(on_body, axis=0)), view.points.take(rows, axis=0)
     of_body = neighbours.number_around(body, points, _SURROUND_M)
     others = neighbours.number_around(view.source.tree, points, _SURROUND_M) - of_body
     return of_body - on_body[rows] > others - ~on_body[rows]   # the point itself has no say

@@ -110,11 +110,9 @@ def tied(
     group = (owners(graph, object_id)[kept] + 1).astype(np.int32)   # group 0 is the static world
     part = graph.problem.part(np.flatnonzero(kept))
     reduced = replace(part, initial=motions.take(group, axis=0), group=group, group_motions=motions)
-    position = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
-    rows = np.flatnonzero(graph.variable >= 0)
-    variable = np.full(len(graph.variable), -1, np.int32)
-    variable[rows] = position[graph.variable[rows]]
-    return Graph(reduced, variable, graph.rows[kept])
+    position = np.full(len(kept) + 1, -1, np.int32)      # the last is that of points without a variable
+    position[:-1][kept] = np.arange(len(reduced.points))
+    return Graph(reduced, position.take(graph.variable), graph.rows[kept])
 
 
 def owners(graph: Graph, object_id: np.ndarray) -> np.ndarray:

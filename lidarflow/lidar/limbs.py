@@ -58,7 +58,9 @@ class Scene:
         solved = np.zeros(len(motions), bool)
         if len(motions):
             surface = refinement.Surface.around(
-                pose.apply(motions, part.problem.points), self.points, self.rows, self.tree, self.mesh)
+                pose.apply(motions, part.problem.points),
+                refinement.margin_m(self.config.refine, self.config.mesh.max_edge_m), self.points, self.rows,
+                self.tree, self.mesh)
             settings = refinement.solver(self.config.solver, self.config.refine)
             motions, solved = refinement.refined(
                 part.problem, motions, surface, self.solve, settings, self.config.refine)

@@ -20,7 +20,6 @@ from lidarflow.rows import lengths
 from lidarflow.types import FlowProblem
 
 _TOLERANCE = 1e-2  # a gain smaller than this share ends a solution
-_MARGIN_M = 1.5   # around where refined things begin: what their limbs may reach
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,14 +38,15 @@ class Surface:
 
     @classmethod
     def around(
-        cls, places: np.ndarray, points: np.ndarray, rows: np.ndarray, upright: Tree, mesh: Mesh
+        cls, places: np.ndarray, margin_m: float, points: np.ndarray, rows: np.ndarray, upright: Tree,
+        mesh: Mesh,
     ) -> "Surface":
-        """Of a scan's points (N, 3), metres, and its mesh, what may be reached from places (M, 3).
+        """Of a scan's points (N, 3) and its mesh, what has a corner nearer than margin_m to places (M, 3).
 
         rows (U,) are those of the points that stand upright and that the tree is over.
         """
         near = np.zeros(len(points), bool)
-        near[rows[neighbours.near_rows(upright, tree.build(places), _MARGIN_M)]] = True
+        near[rows[neighbours.near_rows(upright, tree.build(places), margin_m)]] = True
         a, b, c = near.take(mesh.triangles.T)
         kept = mesh.triangles.compress(a | b | c, axis=0)
         near[kept] = False
@@ -55,6 +55,14 @@ class Surface:
     def nearest(self, points: np.ndarray, reach_m: float) -> np.ndarray:
         """Nearest places (N, 3) on the surface to points (N, 3), metres; NaN where none is within reach."""
         return triangles.nearest(self.triangles, self.lone, points, reach_m)
+
+
+def margin_m(config: RefineConfig, longest_m: float) -> float:
+    """How far from where things begin limbs may ask for a surface whose edges are `longest_m` at most.
+
+    Every round takes a point no farther than it reaches, and the next reaches as far again.
+    """
+    return config.rounds * config.reach_m + longest_m
 
 
 def refined(

@@ -42,13 +42,14 @@ def find(view: View, expected: Tree, config: ObjectsConfig) -> Seeds:
     plane distances point all ways and no shift explains them. Where objects are `expected`, given as a tree
     of their points, everything is a seed.
     """
-    left = _left_behind(view)
     shifted, shift = _shifted(view, config)
-    rows = np.union1d(left, shifted)
-    rows = np.union1d(rows, neighbours.near_rows(view.source.tree, expected, _EXPECTED_RADIUS_M))
+    is_seed = np.zeros(len(view.points), bool)
+    is_seed[shifted] = is_seed[_left_behind(view)] = True
+    is_seed[neighbours.near_rows(view.source.tree, expected, _EXPECTED_RADIUS_M)] = True
+    rows = np.flatnonzero(is_seed)
     shift_of = np.full((len(rows), 3), np.nan)
     shift_of[np.searchsorted(rows, shifted)] = shift
-    return Seeds(rows, shift_of, _clusters(view.points[rows]))
+    return Seeds(rows, shift_of, _clusters(view.points.take(rows, axis=0)))
 
 
 def _clusters(points: np.ndarray) -> tuple[np.ndarray, ...]:
