@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 _SMALL_ANGLE = 1e-4
-_BLOCK = 16384   # rows of one product: more, and BLAS starts threads that go on spinning when it is done
+_BLOCK = 4096    # rows of one product; of very many, BLAS starts threads that go on spinning when it is done
 
 
 def identity(*shape: int) -> np.ndarray:
@@ -63,10 +63,12 @@ def _turned_and_shifted(motion: np.ndarray, vectors: np.ndarray, shift: np.ndarr
     """Vectors (..., 3) turned by one motion (4, 4), then shifted (3,)."""
     rows, turned = vectors.reshape(-1, 3), np.ascontiguousarray(motion[:3, :3].T)
     moved = np.empty((len(rows), 3))
+    shifts = np.empty((min(len(rows), _BLOCK), 3))
+    shifts[:] = shift       # row by row: numpy takes longer to add three numbers to many rows
     for start in range(0, len(rows), _BLOCK):
         block = moved[start: start + _BLOCK]
         np.matmul(rows[start: start + _BLOCK], turned, out=block)
-        block += shift
+        block += shifts[:len(block)]
     return moved.reshape(vectors.shape)
 
 
