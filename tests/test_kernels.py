@@ -313,8 +313,10 @@ def check_ring_basics(count: int) -> None:
     points = random.normal(size=(count, 3)) * random.choice([0.01, 1.0], (count, 1))
     points[::7] = [[np.nan, 1.0, 1.0]]
     points[::11] = [[1.0, 1.0, -np.inf]]
+    points[5::13] = points[4::13][:len(points[5::13])]
     expected = [bool(np.isfinite(point).all() and np.linalg.norm(point) > 0.1) for point in points]
-    np.testing.assert_array_equal(rings.usable(points, 0.1), expected)
+    is_new = [k == 0 or not (point == points[k - 1]).all() for k, point in enumerate(points)]
+    np.testing.assert_array_equal(rings.usable(points, 0.1), np.logical_and(expected, is_new))
 
     azimuth = (np.cumsum(random.normal(0.4, 0.5, count)) + np.pi) % (2 * np.pi) - np.pi
     turn = 2 * np.pi

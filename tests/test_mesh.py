@@ -292,6 +292,15 @@ def test_the_graph_of_a_mesh_has_its_points_edges_and_components(street_scan, th
     assert (problem.initial == pose.identity()).all() and len(problem.initial) == len(graph.rows)
 
 
+@pytest.mark.parametrize("method", ["grid", "tangent"])
+def test_points_that_are_written_twice_change_no_triangle(street_scan, method):
+    kept = street_scan[:, 2] > -1.5
+    once = built(street_scan, kept, method=method)
+    twice = built(np.repeat(street_scan, 2, axis=0), np.repeat(kept, 2), method=method)
+    np.testing.assert_array_equal(2 * once.triangles, twice.triangles)
+    np.testing.assert_array_equal(2 * once.edges, twice.edges)
+
+
 def test_only_points_that_are_kept_are_meshed():
     nothing = built(np.full((200, 3), np.nan))
     assert len(nothing.edges) == 0 and len(nothing.triangles) == 0 and nothing.method == "tangent"

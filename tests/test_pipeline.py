@@ -190,6 +190,24 @@ def test_the_street_moves_where_it_should():
     assert result.is_dynamic[~moves].mean() <= 0.02
 
 
+@pytest.mark.parametrize("how", ["rounded", "target twice", "each point twice"])
+def test_points_that_coincide_are_no_trouble(how):
+    """Clouds on a grid of 5 cm, merged ones, two returns a beam: triangles without an area come of them."""
+    pair, truth = pair_of(synthetic.one_car(8.0, rng(0)), SENSOR, 1)
+    source, target = pair.source.points, pair.target.points
+    if how == "rounded":
+        source, target = np.round(source / 0.05) * 0.05, np.round(target / 0.05) * 0.05
+    elif how == "target twice":
+        target = np.concatenate([target, target])
+    else:
+        source, target = np.repeat(source, 2, axis=0), np.repeat(target, 2, axis=0)
+    result = estimate_flow(ScanPair(Scan(source), Scan(target, pair.target.time_ns)))
+    rows = np.arange(len(truth.flow)) * len(source) // len(truth.flow)
+    error_m = np.linalg.norm(result.flow[rows] - truth.flow, axis=1)
+    assert result.is_dynamic[rows][truth.is_dynamic].mean() > 0.7
+    assert np.median(error_m[truth.is_dynamic]) < 0.1 and error_m[~truth.is_dynamic].mean() < 0.03
+
+
 def test_identical_scans_do_not_flow():
     pair, _ = pair_of(synthetic.one_car(8.0, rng(1)), COARSE, 2)
     same = ScanPair(pair.source, Scan(pair.source.points.copy(), 100_000_000, "again"))

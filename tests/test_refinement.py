@@ -166,7 +166,8 @@ def test_a_scan_without_a_point_upright_says_nothing():
 def test_the_nearest_place_on_triangles_is_the_nearest_of_a_fine_sampling_and_what_is_lone_counts_too():
     generator = rng(5)
     corners = generator.uniform(-1.0, 1.0, (40, 1, 3)) + generator.normal(0.0, 0.2, (40, 3, 3))
-    corners[0, 2] = corners[0, 1]                   # a triangle without an area
+    corners[0, 2] = corners[0, 1]                   # triangles without an area
+    corners[2, 1], corners[3, 2], corners[4, 1:] = corners[2, 0], corners[3, 0], corners[4, 0]
     lone = generator.uniform(-1.5, 1.5, (30, 3))
     asked = generator.uniform(-1.5, 1.5, (700, 3))   # more than one thread's share
     shares = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60.0

@@ -11,12 +11,18 @@ _TURN = 2.0 * math.pi
 
 @njit()
 def usable(points, min_range_m):
-    """Whether points (N, 3) are finite and farther away than `min_range_m`: (N,) bool."""
+    """Whether points (N, 3) are finite, farther away than `min_range_m` and not the one before again (N,).
+
+    Files of two returns a beam write most points twice.
+    """
     found = np.empty(len(points), np.bool_)
+    before_x = before_y = before_z = np.nan
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         is_finite = math.isfinite(x) and math.isfinite(y) and math.isfinite(z)
-        found[i] = is_finite and math.sqrt(x * x + y * y + z * z) > min_range_m
+        is_new = x != before_x or y != before_y or z != before_z
+        found[i] = is_finite and is_new and math.sqrt(x * x + y * y + z * z) > min_range_m
+        before_x, before_y, before_z = x, y, z
     return found
 
 

@@ -70,7 +70,7 @@ def _nearest_in_chunks(corners, boxes, tree, lone, points, reach_m, places):
         _nearest(corners, boxes, tree, lone, points[start:end], reach_m, places[start:end])
 
 
-@njit()
+@njit(error_model="numpy")
 def _nearest(corners, boxes, tree, lone, points, reach_m, places):
     best = -1
     for i in range(len(points)):
@@ -85,7 +85,7 @@ def _nearest(corners, boxes, tree, lone, points, reach_m, places):
             places[i, 0], places[i, 1], places[i, 2] = _closest(corners, best, x, y, z)
 
 
-@njit()
+@njit(error_model="numpy")
 def _nearest_triangle(corners, boxes, tree, x, y, z, best_sq, guess):
     """Squared distance to the nearest triangle, and its number; `best_sq` and -1 if none is nearer."""
     best = -1
@@ -113,9 +113,12 @@ def _apart_sq(corners, i, x, y, z):
     return (px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2
 
 
-@njit(inline="always", error_model="numpy")
+@njit(inline="always")
 def _closest(corners, i, x, y, z):
-    """The place on triangle i nearest to x, y, z: on a corner, on a side, or within (Ericson 2005, 5.1.5)."""
+    """The place on triangle i nearest to x, y, z: on a corner, on a side, or within (Ericson 2005, 5.1.5).
+
+    Corners may coincide.
+    """
     ax, ay, az = corners[i, 0, 0], corners[i, 0, 1], corners[i, 0, 2]
     bx, by, bz = corners[i, 1, 0] - ax, corners[i, 1, 1] - ay, corners[i, 1, 2] - az    # from a to b
     cx, cy, cz = corners[i, 2, 0] - ax, corners[i, 2, 1] - ay, corners[i, 2, 2] - az    # from a to c
@@ -131,7 +134,7 @@ def _closest(corners, i, x, y, z):
         v, w = 1.0, 0.0
     elif c_r >= 0.0 and b_r <= c_r:
         v, w = 0.0, 1.0
-    elif by_c <= 0.0 and b_p >= 0.0 and b_q <= 0.0:
+    elif by_c <= 0.0 and b_p >= 0.0 and b_q <= 0.0 and b_b > 0.0:
         v, w = b_p / (b_p - b_q), 0.0
     elif by_b <= 0.0 and c_p >= 0.0 and c_r <= 0.0:
         v, w = 0.0, c_p / (c_p - c_r)

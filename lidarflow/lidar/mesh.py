@@ -8,6 +8,7 @@ from lidarflow.config import MeshConfig
 from lidarflow.errors import DataError
 from lidarflow.kernels import graphs, normals, tangent_stars
 from lidarflow.kernels import mesh as kernel
+from lidarflow.kernels.grid import first_per_voxel
 from lidarflow.lidar import rings
 
 # Marton et al. 2009 ask for angles of 10 to 120 degrees; scan lines lie farther apart than points along
@@ -16,6 +17,7 @@ _MIN_ANGLE_RAD = np.radians(2.0)
 _MAX_ANGLE_RAD = np.radians(120.0)
 _MAX_SURFACE_ANGLE_RAD = np.radians(45.0)
 _FRAGMENT_POINTS = 20   # smaller components are mended by strips that skip a ring
+_SAME_PLACE_M = 1e-3    # of points this near to one another a local triangulation takes one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +107,7 @@ def _tangent_triangles(
     points: np.ndarray, kept: np.ndarray, surface: np.ndarray, config: MeshConfig, normal_radius_m: float
 ) -> np.ndarray:
     rows = np.flatnonzero(kept)
+    rows = rows[first_per_voxel(points[rows], _SAME_PLACE_M)]
     if len(rows) < 3:
         return np.empty((0, 3), np.int32)
     point_normals = normals.estimate(points[rows], surface, normal_radius_m)
