@@ -193,7 +193,7 @@ def test_the_street_moves_where_it_should():
 @pytest.mark.parametrize("how", ["rounded", "target twice", "each point twice"])
 def test_points_that_coincide_are_no_trouble(how):
     """Clouds on a grid of 5 cm, merged ones, two returns a beam: triangles without an area come of them."""
-    pair, truth = pair_of(synthetic.one_car(8.0, rng(0)), SENSOR, 1)
+    pair, truth = pair_of(synthetic.street(rng(0)), COARSE, 1)
     source, target = pair.source.points, pair.target.points
     if how == "rounded":
         source, target = np.round(source / 0.05) * 0.05, np.round(target / 0.05) * 0.05
