@@ -105,16 +105,21 @@ class FlowEstimator:
         """Flow from the last scan to this one, a Scan or points (N, 3) in metres; None for the first.
 
         Scans without times are taken 0.1 s apart. Raises DataError for a scan that cannot be used; the next
-        one starts anew from it.
+        one starts anew, as the first.
         """
-        scan = as_scan(scan)
+        try:
+            return self._step(as_scan(scan))
+        except BaseException:     # the scan is nobody's source, and no pair may inherit half of another
+            self.reset()
+            raise
+
+    def _step(self, scan: Scan) -> FlowResult | None:
         source, self._scan = self._scan, scan
         if source is None:
-            self._odometry.step(scan.points, 0.0)
             preparation.require_points(scan, self.config.preparation)
+            self._odometry.step(scan.points, 0.0)
             return None
-        # Forgotten first: after a scan that cannot be used, the next pair must not inherit an older one's.
-        previous, self._previous = self._previous, None
+        previous = self._previous
         tracks = self.tracks if previous else Tracks(next_id=self.tracks.next_id)
         pair = ScanPair(source, scan)
         with Aside() as beside:

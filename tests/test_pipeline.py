@@ -13,7 +13,7 @@ from lidarflow import aside, pipeline, pose, synthetic
 from lidarflow.config import Config, EgoConfig, ObjectsConfig, load
 from lidarflow.datasets import open_dataset
 from lidarflow.datasets.clouds import read_points
-from lidarflow.errors import LidarflowError
+from lidarflow.errors import DataError, LidarflowError
 from lidarflow.lidar import ego, frontend, start
 from lidarflow.pipeline import FlowEstimator, estimate_flow
 from lidarflow.types import FlowResult, Scan, ScanPair, Truth
@@ -305,16 +305,22 @@ def test_a_sequence_agrees_with_pairs(drive):
     assert np.median(off_m[graph]) < 0.01
 
 
-def test_a_sequence_goes_on_after_a_bad_scan(drive):
+@pytest.mark.parametrize("bad", [Scan(np.empty((0, 3)), 0, "scan"), np.zeros((5, 2))], ids=["empty", "flat"])
+@pytest.mark.parametrize("before", [0, 1, 2])
+@pytest.mark.parametrize("method", ["registration", "kiss_icp"])
+def test_a_sequence_goes_on_after_a_bad_scan(drive, method, before, bad):
     scans, *_ = drive
-    estimator = FlowEstimator(replace(GRAPH_ALONE, ego=EgoConfig(method="registration")))
-    empty = Scan(np.empty((0, 3)), 0, "empty")
-    for scan in (scans[0], scans[1], empty, scans[2]):
-        try:
-            estimator.step(scan)
-        except LidarflowError as error:
-            assert "empty" in one_line(error)
-    assert_valid(ScanPair(scans[2], scans[1]), estimator.step(scans[1]))
+    config = replace(GRAPH_ALONE, ego=EgoConfig(method=method))
+    estimator = FlowEstimator(config)
+    for scan in scans[:before]:
+        estimator.step(scan)
+    with pytest.raises(DataError) as error:
+        estimator.step(bad)
+    assert "scan" in one_line(error.value)
+    assert estimator.step(scans[1]) is None, "the bad scan is no source, nor is the one before it"
+    result, fresh = estimator.step(scans[2]), FlowEstimator(config)
+    fresh.step(scans[1])
+    np.testing.assert_array_equal(result.flow, fresh.step(scans[2]).flow)
 
 
 # --- scans that are hardly usable ---
