@@ -16,6 +16,15 @@ T = TypeVar("T")
 # Answers of a function to each of some items, in their order.
 Each = Callable[[Callable[[S], T], Sequence[S]], list[T]]
 
+# Numba's last resort, workqueue, aborts the process where two threads run kernels at once.
+_THREADSAFE = ("omp", "tbb")
+
+
+def _may_share_kernels() -> bool:
+    """Whether kernels have threads for more than one caller, and may be run by two at once."""
+    # Asking for their number launches them; before that, numba does not know the layer itself.
+    return numba.get_num_threads() > 1 and numba.threading_layer() in _THREADSAFE
+
 
 # Threads with nothing to do. A new one every time would bring new threads for its kernels, and memory of its
 # own to each of them.
@@ -41,7 +50,7 @@ class Aside:
     """Does what it is given in the order given, in a thread of its own; leaving it waits for all of it.
 
     With one thread for kernels (NUMBA_NUM_THREADS=1) everything is done at once: the other cores are left to
-    other processes.
+    other processes. So it is where numba's threading layer is not known to be safe for two threads.
     """
 
     def __init__(self) -> None:
@@ -50,7 +59,7 @@ class Aside:
         self._last: Future | None = None
 
     def __enter__(self) -> "Aside":
-        if numba.get_num_threads() > 1:
+        if _may_share_kernels():
             self._thread = self._lent.enter_context(_borrowed())
         return self
 
@@ -109,10 +118,10 @@ def there(value: T) -> "Future[T]":
 def ahead(items: Iterator[T]) -> Iterator[Iterator[T]]:
     """`items`, the next of which is made while whoever asks uses the last; leaving waits for it.
 
-    What making one raises is raised where it would have come. With one thread for kernels nothing is made
-    before it is asked for.
+    What making one raises is raised where it would have come. Where an Aside does everything at once, nothing
+    is made before it is asked for.
     """
-    if numba.get_num_threads() == 1:
+    if not _may_share_kernels():
         yield items
         return
     with Aside() as beside:

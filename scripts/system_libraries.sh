@@ -1,9 +1,9 @@
 #!/bin/sh
-# Open3D's wheel links to system libraries that a fresh Debian or Ubuntu lacks: install them where that is
-# allowed, else print the one line to run.
+# Open3D's wheel links to system libraries that a fresh Debian or Ubuntu lacks; numba's to OpenMP, without which
+# two threads cannot run kernels at once. Install them where that is allowed, else print the one line to run.
 set -eu
-libraries="libusb-1.0.so.0 libEGL.so.1 libGL.so.1 libX11.so.6 libudev.so.1 libidn2.so.0"
-packages="libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0"
+libraries="libusb-1.0.so.0 libEGL.so.1 libGL.so.1 libX11.so.6 libudev.so.1 libidn2.so.0 libgomp.so.1"
+packages="libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libgomp1"
 
 missing() {
     known=$(PATH="$PATH:/sbin:/usr/sbin" ldconfig -p)

@@ -50,6 +50,36 @@ def test_with_one_thread_everything_is_done_at_once():
         numba.set_num_threads(before)
 
 
+@pytest.mark.parametrize("layer", ["workqueue", "of some later numba"])
+def test_everything_is_done_at_once_where_two_threads_may_not_run_kernels(monkeypatch, layer):
+    monkeypatch.setattr(numba, "threading_layer", lambda: layer)
+    with Aside() as beside:
+        assert beside.begin(threading.get_ident).result() == threading.get_ident()
+        assert set(beside.each(lambda _: threading.get_ident(), range(9))) == {threading.get_ident()}
+    made: list[int] = []
+    with ahead(failing_after(4, made)) as items:
+        assert next(items) == 0 and made == [0]
+
+
+@needs_two_threads
+def test_a_pair_is_estimated_by_numbas_workqueue():
+    program = """
+import numba, numpy as np
+from lidarflow import estimate_flow, synthetic
+scene = synthetic.one_car(8.0, np.random.default_rng(2))
+(source, truth), (target, _) = synthetic.scan_sequence(
+    scene, synthetic.hdl64e(columns=450), 2, np.random.default_rng(3))
+result = estimate_flow((source, target))
+assert numba.threading_layer() == "workqueue"
+off_m = np.linalg.norm(result.flow - truth.flow, axis=1)
+assert len(result.objects) == 1 and np.median(off_m[truth.is_dynamic]) < 0.02
+"""
+    environment = {**os.environ, "NUMBA_THREADING_LAYER": "workqueue"}
+    ended = subprocess.run([sys.executable, "-c", program], env=environment, timeout=300, check=False,
+                           capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+
+
 @needs_two_threads
 def test_items_are_shared_between_threads_and_answers_come_in_order():
     both = threading.Barrier(2, timeout=5.0)
