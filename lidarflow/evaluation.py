@@ -62,7 +62,7 @@ def evaluate_run(run_dir: Path, truth: Path | None = None, data: Path | None = N
             raise DataError(f"{run_dir}: {len(files)} flow files for {len(source.pairs)} pairs; "
                             "was the run cut short? run it again")
         reports = [_from_files(file, following, truth, len(files), config)
-                   for file, following in zip(files, [*files[1:], None], strict=True)]
+                   for file, following in zip(files, _following(files, source), strict=True)]
     else:
         reports = list(_from_dataset(run_dir, files, dataset, source, truth, config))
     place = str(truth) if truth is not None else str(dataset.source.folder)
@@ -140,10 +140,16 @@ def _from_dataset(
                         "that the run went through; is this the data of the run?")
 
 
+def _following(files: list[Path], run: RunSource) -> list[Path | None]:
+    """For every pair's flow file that of its target scan; None at the end, and before a gap."""
+    file_of = {index: file for (index, _), file in zip(run.pairs, files, strict=True)}
+    return [file_of.get(following) for _, following in run.pairs]
+
+
 def _from_files(
     file: Path, following: Path | None, truth: Path, pairs: int, config: Config
 ) -> PairReport:
-    """A report without the data set: the target is the next flow file's cloud, where there is one."""
+    """A report without the data set: the target is the cloud of the `following` flow file, if any."""
     points, result = _read(file)
     source = Scan(points, name=file.stem)
     known = _given_truth(truth, source.name, len(source), pairs)

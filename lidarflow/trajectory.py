@@ -28,11 +28,20 @@ class Trajectory:
             self._poses.append(self._poses[-1] @ self._step)
         return self._poses[index - self._first]
 
-    def add(self, index: int, pair: ScanPair | RgbdPair, ego_motion: np.ndarray) -> None:
+    def go(self, index: int, ego_motion: np.ndarray) -> None:
         """Go from the scan `index` to the next by its ego_motion (4, 4), target_from_source."""
         world_from_source, self._step = self.reached(index), pose.inverse(ego_motion)
         self._poses.append(world_from_source @ self._step)
+
+    def add(self, index: int, pair: ScanPair | RgbdPair, ego_motion: np.ndarray) -> None:
+        """Go from the scan `index` to the next, and learn their times."""
+        self.go(index, ego_motion)
         self._times_ns |= {index: pair.source.time_ns, index + 1: pair.target.time_ns}
+
+    def poses(self) -> np.ndarray:
+        """world_from_sensor (N, 4, 4) at all scans, also where their time is not known."""
+        self.reached(self._first + self._count - 1)
+        return np.stack(self._poses)
 
     def timed(self) -> tuple[list[int], np.ndarray, list[int]]:
         """Indices (K,), poses (K, 4, 4) and times of the scans whose time is known, those of the pairs."""
@@ -46,6 +55,5 @@ class Trajectory:
 
     def write(self, out: Path) -> None:
         """Write poses_kitti.txt, a row for every scan, and poses_tum.txt."""
-        self.reached(self._first + self._count - 1)
-        io.write_poses_kitti(out / "poses_kitti.txt", np.stack(self._poses))
+        io.write_poses_kitti(out / "poses_kitti.txt", self.poses())
         self.write_tum(out)

@@ -68,7 +68,7 @@ def _write(
 
 def _counted(run: FinishedRun, masks: Masks) -> Masks:
     """`masks`; DataError where they count a sweep that the run has no flow of."""
-    lacking = sorted(masks.times_ns - set(run.times_ns[:-1].tolist()))
+    lacking = sorted(masks.times_ns - set(run.times_ns[run.sources()].tolist()))
     if lacking:
         raise DataError(f"{run.folder}: no flow of {len(lacking)} of the {len(masks.times_ns)} sweeps that "
                         f"{masks.archive} counts, {lacking[0]} is the first; run over the whole log")

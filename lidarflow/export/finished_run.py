@@ -1,4 +1,4 @@
-"""A run's results as the formats take them: pairs in order, times and poses of all scans."""
+"""A run's results as the formats take them: pairs in order, times and poses of their scans."""
 
 import re
 from collections.abc import Iterator
@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, provenance, rgbd_io
+from lidarflow import io, pose, provenance, rgbd_io
 from lidarflow.config import Config, load
 from lidarflow.datasets import Dataset, tum
 from lidarflow.datasets.argoverse2 import Argoverse2
 from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.errors import DataError
+from lidarflow.provenance import RunSource
+from lidarflow.trajectory import Trajectory
 
 _FINISH = "was the run cut short? run it again"
 
@@ -21,12 +23,18 @@ _FINISH = "was the run cut short? run it again"
 class FinishedRun:
     """A run folder, and where its data are now if not where they were.
 
+    Its scans are those of its pairs, numbered on over the gaps where others were left out.
+
+    source             RunSource            what it was made of
+    scans              N of int             index of every scan in the data set
     times_ns           (N,) int64           time of every scan, increasing
     world_from_sensor  (N, 4, 4) float64    pose of every scan; the first is the world
     """
 
     folder: Path
     data: Path | None
+    source: RunSource
+    scans: tuple[int, ...]
     times_ns: np.ndarray
     world_from_sensor: np.ndarray
 
@@ -42,30 +50,49 @@ class FinishedRun:
         times_ns, world_from_sensor = tum.read_poses(poses)
         if len(times_ns) < 2 or not (np.diff(times_ns) > 0).all():
             raise DataError(f"{poses}: expected a pose for two scans or more, in order of time; {_FINISH}")
-        return cls(folder, data, times_ns, world_from_sensor)
+        source = provenance.read_any(folder)
+        scans = tuple(sorted({index for pair in source.pairs for index in pair}))
+        if len(scans) != len(times_ns):
+            raise DataError(f"{poses}: {len(times_ns)} poses for {len(scans)} scans; {_FINISH}")
+        return cls(folder, data, source, scans, times_ns, world_from_sensor)
+
+    def sources(self) -> list[int]:
+        """Number of the source scan of every pair, in order; its target is the next scan."""
+        number_of = {index: number for number, index in enumerate(self.scans)}
+        return [number_of[index] for index, _ in self.source.pairs]
 
     def pairs(self) -> Iterator[tuple[int, str, io.FlowFile]]:
-        """Number, name of the source scan and flow of every pair; DataError where one is missing."""
+        """Number and name of the source scan, and flow, of every pair; DataError where one is missing."""
+        sources = self.sources()
         files = natural_sorted((self.folder / io.FLOW_FOLDER).glob("*.npz"))
-        if len(files) != len(self.times_ns) - 1:
-            raise DataError(f"{self.folder}: {len(files)} flow files for {len(self.times_ns) - 1} pairs; "
-                            f"{_FINISH}")
-        for number, file in enumerate(files):
+        if len(files) != len(sources):
+            raise DataError(f"{self.folder}: {len(files)} flow files for {len(sources)} pairs; {_FINISH}")
+        for number, file in zip(sources, files, strict=True):
             if rgbd_io.is_rgbd_flow(file):
                 raise DataError(f"{self.folder}: is a run of RGB-D images; of those, only poses are exported")
             yield number, file.stem, io.load_flow(file)
 
     def dt_s(self, number: int) -> float:
-        """Seconds from the source to the target of a pair."""
+        """Seconds from the source scan of a pair to its target."""
         return float(self.times_ns[number + 1] - self.times_ns[number]) * 1e-9
 
     def dataset(self) -> Dataset:
         """The data set that the run was made of; DataError where it is not at hand."""
         return provenance.opened(self.folder, provenance.read(self.folder).dataset, self.data)
 
-    def last_scan(self, dataset: Dataset) -> np.ndarray:
-        """Points (N, 3) of the last scan, metres: the only one without a flow file."""
-        return dataset.scan(provenance.read(self.folder).scans[-1]).points
+    def without_flow(self, dataset: Dataset) -> Iterator[tuple[int, np.ndarray]]:
+        """Number and points (N, 3), metres, of scans that are no source: the last, and those before a gap."""
+        for number in sorted(set(range(len(self.scans))).difference(self.sources())):
+            yield number, dataset.scan(self.scans[number]).points
+
+    def every_pose(self) -> np.ndarray:
+        """Poses (N, 4, 4) of all scans gone through, with those that were left out, as in poses_kitti.txt."""
+        row_of = {index: row for row, index in enumerate(self.source.scans)}
+        way = Trajectory(list(row_of.values()))
+        for number in self.sources():
+            world_from_source, world_from_target = self.world_from_sensor[number:number + 2]
+            way.go(row_of[self.scans[number]], pose.inverse(world_from_target) @ world_from_source)
+        return way.poses()
 
     def config(self) -> Config:
         """The settings that the run was made with."""

@@ -1,9 +1,10 @@
 """OpenSceneFlow's layout (Zhang et al., KTH): <scene>.h5 with a group per time, and the lists of groups.
 
 A group holds `lidar` (N, 3) float32, `ground_mask` (N,) bool and `pose` (4, 4) float32 world_from_sensor; all
-but the last also `flow` (N, 3) float32 total, `flow_is_valid` (N,) bool, `flow_category_indices` (N,) uint8,
-`flow_instance_id` (N,) int16 and `ego_motion` (4, 4) float32 target_from_source. index_total.pkl and
-index_flow.pkl list [scene, time] of all groups, and of those with a flow, of every .h5 file in the folder.
+but the last, at the end or before a gap, also `flow` (N, 3) float32 total, `flow_is_valid` (N,) bool,
+`flow_category_indices` (N,) uint8, `flow_instance_id` (N,) int16 and `ego_motion` (4, 4) float32
+target_from_source. index_total.pkl and index_flow.pkl list [scene, time] of all groups, and of those with a
+flow, of every .h5 file in the folder.
 """
 
 import pickle
@@ -29,12 +30,12 @@ def write(run: FinishedRun, out: Path) -> Iterator[Path]:
     except ImportError:
         raise InstallError(f"{out}: .h5 needs the package h5py; pip install h5py") from None
     dataset = run.dataset()
-    last = _scan_arrays(run.last_scan(dataset), run)
     file = out / f"{scene_name(dataset)}.h5"
     with written_aside(file) as aside, h5py.File(aside, "w") as archive:
         for number, _, found in run.pairs():
             _write_group(archive, run, number, _pair_arrays(found))
-        _write_group(archive, run, len(run.times_ns) - 1, last)
+        for number, points in run.without_flow(dataset):
+            _write_group(archive, run, number, _scan_arrays(points, run))
     yield file
     yield from _write_lists(out, h5py)
 
