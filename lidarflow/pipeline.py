@@ -105,10 +105,11 @@ class FlowEstimator:
         """Flow from the last scan to this one, a Scan or points (N, 3) in metres; None for the first.
 
         Scans without times are taken 0.1 s apart. Raises DataError for a scan that cannot be used; the next
-        one starts anew, as the first.
+        one starts anew, as the first. An array of another shape is no scan, and changes nothing.
         """
+        scan = as_scan(scan)
         try:
-            return self._step(as_scan(scan))
+            return self._step(scan)
         except BaseException:     # the scan is nobody's source, and no pair may inherit half of another
             self.reset()
             raise

@@ -305,18 +305,17 @@ def test_a_sequence_agrees_with_pairs(drive):
     assert np.median(off_m[graph]) < 0.01
 
 
-@pytest.mark.parametrize("bad", [Scan(np.empty((0, 3)), 0, "scan"), np.zeros((5, 2))], ids=["empty", "flat"])
 @pytest.mark.parametrize("before", [0, 1, 2])
 @pytest.mark.parametrize("method", ["registration", "kiss_icp"])
-def test_a_sequence_goes_on_after_a_bad_scan(drive, method, before, bad):
+def test_a_sequence_goes_on_after_a_bad_scan(drive, method, before):
     scans, *_ = drive
     config = replace(GRAPH_ALONE, ego=EgoConfig(method=method))
     estimator = FlowEstimator(config)
     for scan in scans[:before]:
         estimator.step(scan)
     with pytest.raises(DataError) as error:
-        estimator.step(bad)
-    assert "scan" in one_line(error.value)
+        estimator.step(Scan(np.empty((0, 3)), 0, "empty"))
+    assert "empty" in one_line(error.value)
     assert estimator.step(scans[1]) is None, "the bad scan is no source, nor is the one before it"
     result, fresh = estimator.step(scans[2]), FlowEstimator(config)
     fresh.step(scans[1])
