@@ -5,8 +5,12 @@ from dataclasses import FrozenInstanceError, fields
 import pytest
 from shared_data import ROOT
 
-from lidarflow.config import Config, describe, load, to_dict, updated
+from lidarflow.config import Config, describe, load, read_toml, to_dict, updated
 from lidarflow.errors import ConfigError
+from lidarflow.rgbd_config import RgbdConfig
+
+FILES = ([(Config, file) for file in sorted((ROOT / "configs").glob("*.toml"))]
+         + [(RgbdConfig, file) for file in sorted((ROOT / "configs" / "rgbd").glob("*.toml"))])
 
 
 def toml(tmp_path, text: str):
@@ -125,3 +129,11 @@ def test_every_setting_is_described_with_an_effect_and_keeps_its_own_limits():
 @pytest.mark.parametrize("file", sorted((ROOT / "configs").glob("*.toml")), ids=lambda file: file.stem)
 def test_the_files_of_settings_load_and_change_something(file):
     assert load(file) != Config()
+
+
+@pytest.mark.parametrize(("kind", "file"), FILES, ids=[file.stem for _, file in FILES])
+def test_the_files_of_settings_hold_differences_only(kind, file):
+    defaults = to_dict(kind())
+    for section, values in read_toml(file).items():
+        for name, value in values.items():
+            assert value != defaults[section][name], f"{section}.{name} is the default"
