@@ -137,7 +137,7 @@ class FlowProblem:
     initial        (M, 4, 4) float64   start values of τ, target_from_source
     match_index    (K,) int32          the variable a match belongs to; at most one match each
     match_target   (K, 3) float64      the matched position p', metres, target frame
-    edges          (E, 2) int32        mesh neighbours, i < j, unique
+    edges          (E, 2) int32        mesh neighbours, i < j, unique, both in one component
     component      (M,) int32          mesh component of each variable, 0 .. C-1
     group          (M,) int32          group whose motion ties a variable, -1 = free; empty = all free
     group_motions  (G, 4, 4) float64   motion of each group (the ego-motion, an object's), target_from_source
@@ -167,8 +167,13 @@ class FlowProblem:
         for name, index in (("match_index", self.match_index), ("edges", self.edges)):
             if index.size and (index.min() < 0 or index.max() >= m):
                 raise ValueError(f"FlowProblem.{name}: indices must lie in 0..{m - 1}")
-        if len(self.edges) and not (self.edges[:, 0] < self.edges[:, 1]).all():
+        first, second = self.edges.T
+        if not (first < second).all():
             raise ValueError("FlowProblem.edges: expected i < j in every row")
+        if self.component.min(initial=0) < 0:
+            raise ValueError("FlowProblem.component: expected numbers from 0 on")
+        if (self.component.take(first) != self.component.take(second)).any():
+            raise ValueError("FlowProblem.edges: expected both ends of an edge in one component")
         if np.bincount(self.match_index).max(initial=0) > 1:
             raise ValueError("FlowProblem.match_index: a variable has more than one match")
 

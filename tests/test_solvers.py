@@ -12,6 +12,7 @@ from lidarflow import pose
 from lidarflow.config import SolverConfig
 from lidarflow.errors import SolveError
 from lidarflow.solve import solve as solve_by_name
+from lidarflow.types import FlowProblem
 
 MIN_MATCHES = 3
 DEFAULT = SolverConfig()
@@ -306,3 +307,16 @@ def test_numbers_that_are_not_finite_are_an_error(solve, field):
     broken[0, 0] = np.nan
     with pytest.raises(SolveError, match=f"FlowProblem.{field}.*finite"):
         solve(replace(tied, **{field: broken}))
+
+
+@pytest.mark.parametrize("changes, message", [
+    ({"component": np.array([0, -1, 1], np.int32)}, "component: expected numbers from 0 on"),
+    ({"component": np.array([0, 1, 1], np.int32)}, "edges: expected both ends of an edge in one component"),
+    ({"edges": np.array([[1, 0]], np.int32)}, "edges: expected i < j"),
+    ({"edges": np.array([[0, 3]], np.int32)}, "edges: indices must lie in 0..2"),
+    ({"match_index": np.array([1, 1], np.int32), "match_target": np.zeros((2, 3))}, "more than one match")])
+def test_what_would_lead_out_of_the_arrays_is_an_error(changes, message):
+    problem = FlowProblem(np.zeros((3, 3)), pose.identity(3), np.array([1], np.int32), np.zeros((1, 3)),
+                          np.array([[0, 2]], np.int32), np.array([0, 1, 0], np.int32))
+    with pytest.raises(ValueError, match=message):
+        replace(problem, **changes)
