@@ -104,9 +104,10 @@ def check_thinned(count: int) -> None:
 
 
 def check_nothing_thinned() -> None:
-    for points in (np.empty((0, 3)), np.full((4, 3), np.nan), np.zeros((4, 3))):
-        means, grown, found, _, in_range = thinning.thinned(points, 0.0, 80.0, 0.2, 0.04, 3.5)
-        assert len(means) == len(grown.points) == len(found) == in_range
+    clouds = [np.full((4, 3), value) for value in (np.nan, np.inf, 0.0, 1e12, 1e300)]
+    for points in (np.empty((0, 3)), *clouds):
+        means, grown, found, _, in_range = thinning.thinned(points, 0.0, np.inf, 0.2, 0.04, 3.5)
+        assert len(means) == len(grown.points) == len(found) == in_range == 0
         assert np.isnan(found).all()
 
 

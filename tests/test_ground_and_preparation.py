@@ -5,6 +5,7 @@ import pytest
 
 from lidarflow import open3d_import, pose, synthetic
 from lidarflow.config import GroundConfig, PreparationConfig
+from lidarflow.kernels import thinning
 from lidarflow.lidar import ground, preparation
 from lidarflow.synthetic import Part, Scene, shapes
 from lidarflow.synthetic.raycast import raycasting_scene
@@ -22,6 +23,15 @@ def test_missing_near_and_far_returns_are_masked():
     kept = preparation.usable(points, PreparationConfig(min_range_m=2.0, max_range_m=80.0))
     np.testing.assert_array_equal(kept, [True, False, False, False, False, False, True, True, False, True])
     assert preparation.usable(np.empty((0, 3)), PreparationConfig()).shape == (0,)
+
+
+def test_what_is_no_return_is_masked_whatever_the_limits():
+    points = np.array([[5.0, 0, 0], [np.nan, 0, 0], [0, np.inf, 0], [-np.inf] * 3, [0, 0, 0], [0, 0.01, 0],
+                       [1e12, 0, 0], [0, 0, 1e300], [5000.0, 0, 0]])
+    limits = PreparationConfig(min_range_m=0.0, max_range_m=np.inf)
+    kept = preparation.usable(points, limits)
+    np.testing.assert_array_equal(kept, [True, False, False, False, False, True, False, False, True])
+    np.testing.assert_array_equal(thinning.in_range(points, 0.0, np.inf)[0], points[kept])
 
 
 def distance_to(parts, points: np.ndarray) -> np.ndarray:

@@ -4,14 +4,16 @@ import numpy as np
 
 from lidarflow.config import PreparationConfig
 from lidarflow.errors import DataError
+from lidarflow.kernels.thinning import FARTHEST_M, NEAREST_M
 from lidarflow.types import Scan
 
 
 def usable(points: np.ndarray, config: PreparationConfig) -> np.ndarray:
     """Mask (N,) of the points (N, 3), metres in the sensor frame, that take part."""
+    nearest_m, farthest_m = max(config.min_range_m, NEAREST_M), min(config.max_range_m, FARTHEST_M)
     with np.errstate(invalid="ignore", over="ignore"):
         range_sq = np.einsum("ij,ij->i", points, points)
-        return (range_sq >= config.min_range_m**2) & (range_sq <= config.max_range_m**2)
+        return (range_sq >= nearest_m**2) & (range_sq <= farthest_m**2)
 
 
 def require_points(scan: Scan, config: PreparationConfig) -> None:
