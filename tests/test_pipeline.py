@@ -10,11 +10,11 @@ from scipy.spatial import KDTree
 from shared_data import SHARED, needs_shared
 
 from lidarflow import aside, pipeline, pose, synthetic
-from lidarflow.config import Config, EgoConfig, ObjectsConfig, load
+from lidarflow.config import Config, EgoConfig, ObjectsConfig, PreparationConfig, load
 from lidarflow.datasets import open_dataset
 from lidarflow.datasets.clouds import read_points
 from lidarflow.errors import DataError, LidarflowError
-from lidarflow.lidar import ego, frontend, start
+from lidarflow.lidar import ego, frontend, registration, start
 from lidarflow.pipeline import FlowEstimator, estimate_flow
 from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
@@ -403,6 +403,22 @@ def test_the_last_motion_goes_on_for_as_long_as_the_next_pair_takes():
     assert guess.step(np.empty((0, 3)), 0.1) is None, "nothing is known of the motion to the last scan"
     guess.found(motion, 0.1)
     np.testing.assert_allclose(guess.step(np.empty((0, 3)), 0.2), motion @ motion, atol=1e-12)
+
+
+def test_returns_at_the_sensor_are_none():
+    pair, truth = pair_of(synthetic.street(rng(4)), COARSE, 5)
+    config = replace(Config(), preparation=PreparationConfig(min_range_m=0.0))
+    source, target = (
+        ego.Thinned.of(np.vstack([scan.points, 0 * scan.points, scan.points[:9]]), config)
+        for scan in (pair.source, pair.target))
+    assert_same_motion(ego.register(source, target), truth.ego_motion, 0.05, 0.15)
+
+
+def test_a_cloud_without_extent_cannot_be_registered():
+    points = rng(1).normal(size=(100, 3))
+    nothing = ego.Thinned(points, registration.Planes.of(points, 0.2), 0.0)
+    with pytest.raises(DataError, match="no extent"):
+        ego.register(nothing, nothing)
 
 
 @pytest.mark.parametrize("wrong", [(0, 0, 0.3, 0, 0, 0), (0, 0, 0, 2.5, 0, 0), (0, 0, 3.0, 0, 0, 0),

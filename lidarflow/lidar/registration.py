@@ -33,7 +33,7 @@ def voxel_for(points: np.ndarray, wanted_m: float) -> float:
 
 
 def thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
-    """Points (N, 3) averaged per voxel (M, 3); DataError where too few are left."""
+    """Points (N, 3) averaged per voxel (M, 3); DataError where too few are left, or all are in one place."""
     found = grid.means(points, voxel_m) if voxel_m > 0 else points
     _require_enough(found, len(points), voxel_m)
     return found
@@ -45,6 +45,8 @@ def _require_enough(found: np.ndarray, count: int, voxel_m: float) -> None:
             f"registration: a scan has {count} points in range, {len(found)} after thinning to "
             f"{voxel_m:.2g} m, and registration needs {_MIN_POINTS}; is the scan complete and in metres, is "
             "preparation.min_range_m too large for the place?")
+    if voxel_m <= 0:
+        raise DataError(f"registration: a scan of {count} points has no extent; do most lie at the sensor?")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
