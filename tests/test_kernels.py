@@ -459,6 +459,17 @@ def check_tangent_stars(count: int) -> None:
     assert 1.2 * count < len(triangles) < 2.0 * count
 
 
+def check_agreed(count: int) -> None:
+    random = rng(9)
+    order, stars = random.permutation(count), random.integers(0, count, (4 * count, 3))
+    again = stars[random.integers(0, len(stars), 2 * count)][:, [1, 2, 0]]
+    stars = np.concatenate([stars, again, again[: count // 2], np.full((count, 3), -1)])
+    random.shuffle(stars)
+    found, votes = np.unique(
+        np.sort(order[stars[stars[:, 0] >= 0]], axis=1), axis=0, return_counts=True)
+    np.testing.assert_array_equal(tangent_stars._agreed(stars, order), found[votes >= 2])
+
+
 def check_all_tiny() -> None:
     """Every comparison on tiny inputs, for interpreted kernels."""
     check_voxels(60)
@@ -475,6 +486,7 @@ def check_all_tiny() -> None:
     check_ring_basics(60)
     check_graphs(30)
     check_tangent_stars(150)
+    check_agreed(20)
 
 
 def test_first_per_voxel():
@@ -576,6 +588,14 @@ def test_ring_basics():
 
 def test_tangent_stars():
     check_tangent_stars(1200)
+    check_agreed(300)
+
+
+def test_corners_of_stars_are_told_apart_among_millions_of_points():
+    order, star = np.arange(2_500_000), np.array([2_400_000, 5, 2_200_000])
+    stars = np.stack([star, star[[1, 2, 0]], star - [1, 0, 0]])
+    np.testing.assert_array_equal(tangent_stars._agreed(stars, order), [[5, 2_200_000, 2_400_000]])
+    assert len(tangent_stars._agreed(stars[1:], order)) == 0
 
 
 @pytest.mark.parametrize("spacing_m", [0.25, 0.08, 0.02])

@@ -48,13 +48,9 @@ def triangles(
     """
     limits = (max_edge_m, max_edge_rad, max_depth_jump_m, math.sin(min_grazing_rad))
     order, cloud = _arranged(points, normals, max_edge_m)
-    corners = _star_triangles(
+    stars = _star_triangles(
         cloud, limits, math.cos(max_surface_angle_rad), math.cos(min_angle_rad), math.cos(max_angle_rad))
-    corners = np.sort(order[corners.reshape(-1, 3)[corners.reshape(-1, 3)[:, 0] >= 0]], axis=1)
-    n = np.int64(len(points))
-    keys, votes = np.unique((corners[:, 0] * n + corners[:, 1]) * n + corners[:, 2], return_counts=True)
-    keys = keys[votes >= 2]
-    return np.stack([keys // (n * n), keys // n % n, keys % n], axis=1).astype(np.int32)
+    return _agreed(stars.reshape(-1, 3), order)
 
 
 def _arranged(points: np.ndarray, normals: np.ndarray, max_edge_m: float) -> tuple[np.ndarray, Cloud]:
@@ -84,6 +80,58 @@ def _star_triangles(cloud, limits, min_agreement, max_cosine, min_cosine):
                 triangles[i, slot, 1], triangles[i, slot, 2] = near[a], near[b]
                 slot += 1
     return triangles
+
+
+@njit()
+def _agreed(stars, order):
+    """Triangles (T, 3) int32, i < j < k, ascending, that are more than once among those of stars (S, 3).
+
+    Corners of stars, -1 where there is no triangle, are places in `order` (N,), which has their rows.
+    """
+    count, found = len(order), 0
+    lowest, others = np.empty(len(stars), np.int64), np.empty(len(stars), np.int64)
+    for t in range(len(stars)):
+        if stars[t, 0] >= 0:
+            a, b, c = order[stars[t, 0]], order[stars[t, 1]], order[stars[t, 2]]
+            low, high = min(a, b, c), max(a, b, c)
+            # Three rows in one number would overflow where there are millions of points.
+            lowest[found], others[found] = low, (a + b + c - low - high) * count + high
+            found += 1
+    sorted_others, ends = _sorted_by_lowest(lowest[:found], others[:found], count)
+    return _repeated(sorted_others, ends, found // 2)
+
+
+@njit()
+def _sorted_by_lowest(lowest, others, count):
+    """The `others` (S,) by their `lowest` (S,), ascending for each, and where each of `count` ends."""
+    counts = np.zeros(count, np.int64)
+    for t in range(len(lowest)):
+        counts[lowest[t]] += 1
+    starts = np.cumsum(counts) - counts
+    ends, ascending = starts.copy(), np.empty(len(others), np.int64)
+    for t in range(len(lowest)):
+        i, at = lowest[t], ends[lowest[t]]
+        while at > starts[i] and ascending[at - 1] > others[t]:
+            ascending[at] = ascending[at - 1]
+            at -= 1
+        ascending[at] = others[t]
+        ends[i] += 1
+    return ascending, ends
+
+
+@njit()
+def _repeated(others, ends, room):
+    """Triangles (T, 3) int32, at most `room`, that `_sorted_by_lowest` gives more than once."""
+    triangles, found, start = np.empty((room, 3), np.int32), 0, 0
+    for i in range(len(ends)):
+        for at in range(start + 1, ends[i]):
+            is_second = at == start + 1 or others[at - 2] != others[at]
+            if others[at - 1] == others[at] and is_second:
+                triangles[found, 0] = i
+                triangles[found, 1], triangles[found, 2] = others[at] // len(ends), others[at] % len(ends)
+                found += 1
+        start = ends[i]
+    return triangles[:found].copy()
 
 
 @njit()
