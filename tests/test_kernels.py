@@ -86,6 +86,20 @@ def check_grid_queries(count: int) -> None:
         assert set(within) <= set(seen)
 
 
+def check_far_points(count: int) -> None:
+    """A point far off, in a grid of more cells than there are numbers, changes nothing for the others."""
+    points = rng(10).uniform(-2, 2, (count, 3))
+    for far in (np.full(3, 1e12), np.full(3, -1e12), np.array([1.0, -1e300, 1e300]), np.full(3, 1e300)):
+        order, keys, lower, shape = grid.build(np.vstack([points, far]), 0.5)
+        for query in (*points[::5], far):
+            starts, ends = np.empty(9, np.int64), np.empty(9, np.int64)
+            runs = grid.runs(query, keys, lower, shape, 0.5, starts, ends)
+            seen = [row for k in range(runs) for row in order[starts[k]:ends[k]]]
+            assert len(set(seen)) == len(seen)
+            within = np.flatnonzero(np.abs(points - query).max(axis=1) <= 0.5)
+            assert set(within) <= set(seen) and (count in seen or query is not far)
+
+
 # ---- linear algebra -------------------------------------------------------------------------------------
 
 def symmetric_matrices(count: int) -> list[np.ndarray]:
@@ -475,6 +489,7 @@ def check_all_tiny() -> None:
     check_voxels(60)
     check_means(60)
     check_grid_queries(40)
+    check_far_points(20)
     check_eigen(2)
     check_plane_eigen(2)
     check_normals(120)
@@ -492,6 +507,7 @@ def check_all_tiny() -> None:
 def test_first_per_voxel():
     check_voxels(2000)
     assert len(grid.first_per_voxel(np.empty((0, 3)), 0.1)) == 0
+    np.testing.assert_array_equal(grid.first_per_voxel(np.array([[1e300, 0, 0], [1, 1, 1]]), 0.1), [0, 1])
 
 
 def test_means_per_voxel():
@@ -501,6 +517,7 @@ def test_means_per_voxel():
 
 def test_grid_queries_see_every_neighbour_once():
     check_grid_queries(400)
+    check_far_points(400)
 
 
 def test_symmetric_eigen3():

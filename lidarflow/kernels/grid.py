@@ -11,6 +11,8 @@ import numpy as np
 from lidarflow.kernels import cells
 from lidarflow.kernels.compiled import njit
 
+_MOST_CELLS = 2.0**20     # along an axis, so that keys fit into int64; what is beyond shares the last
+
 
 def build(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Grid of finite points (N, 3): order (N,), sorted keys (N,), lower corner (3,), cells per axis (3,)."""
@@ -27,7 +29,7 @@ def _keys(points, cell_m):
         lower[k], upper[k] = points[:, k].min() - cell_m, points[:, k].max()
     shape, keys = np.empty(3, np.int64), np.empty(len(points), np.int64)
     for k in range(3):
-        shape[k] = math.floor((upper[k] - lower[k]) / cell_m) + 3
+        shape[k] = _cells_along(upper[k] - lower[k], cell_m) + 3
     for i in range(len(points)):
         x, y, z = cell_of(points[i], lower, cell_m)
         keys[i] = (x * shape[1] + y) * shape[2] + z
@@ -80,13 +82,13 @@ def averaged(points, voxel_m):
 def first_of_each(points, voxel_m):
     """As `first_per_voxel`, for other kernels."""
     number, counts = cells.numbered(points, voxel_m)
-    first, least_sq = np.empty(len(counts), np.int64), np.full(len(counts), np.inf)
+    first, least_sq = np.full(len(counts), -1), np.full(len(counts), np.inf)
     for i in range(len(points)):
         off_sq = 0.0
         for k in range(3):
             place = points[i, k] / voxel_m
             off_sq += (place - math.floor(place) - 0.5) ** 2
-        if off_sq < least_sq[number[i]]:
+        if first[number[i]] < 0 or off_sq < least_sq[number[i]]:     # it may overflow
             least_sq[number[i]], first[number[i]] = off_sq, i
     is_first = np.zeros(len(points), np.bool_)     # the way to sort them that takes no comparisons
     for voxel in range(len(counts)):
@@ -125,8 +127,14 @@ def runs(query, keys, lower, shape, cell_m, starts, ends):
 @njit(inline="always")
 def cell_of(query, lower, cell_m):
     """Indices of the cell of `query` (3,), which may lie outside the grid."""
-    return (math.floor((query[0] - lower[0]) / cell_m), math.floor((query[1] - lower[1]) / cell_m),
-            math.floor((query[2] - lower[2]) / cell_m))
+    return (_cells_along(query[0] - lower[0], cell_m), _cells_along(query[1] - lower[1], cell_m),
+            _cells_along(query[2] - lower[2], cell_m))
+
+
+@njit(inline="always")
+def _cells_along(distance_m, cell_m):
+    """How many cells are in a distance along an axis, at most 2^20 either way: neighbours stay so."""
+    return math.floor(min(max(distance_m / cell_m, -_MOST_CELLS), _MOST_CELLS))
 
 
 @njit()
