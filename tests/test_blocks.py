@@ -94,19 +94,21 @@ def check_thinned(count: int) -> None:
     range_m = np.linalg.norm(points, axis=1)
     kept = points[(range_m >= 1.5) & (range_m <= 30.0)]
     for wanted_m, share in ((0.5, 1.0), (0.5, 0.04)):
-        means, grown, found, voxel_m, in_range = thinning.thinned(points, 1.5, 30.0, wanted_m, share, 3.5)
+        means, grown, found, voxel_m, in_range = thinning.thinned(
+            points, 1.5, 30.0, wanted_m, share, 3.5, 0.25)
         assert in_range == len(kept)
         np.testing.assert_allclose(voxel_m, min(wanted_m, share * np.sqrt(np.median((kept**2).sum(axis=1)))))
         np.testing.assert_array_equal(means, grid.means(kept, voxel_m))
         np.testing.assert_array_equal(grown.points, means[grown.rows])
         np.testing.assert_array_equal(np.sort(grown.rows), np.arange(len(means)))
-        np.testing.assert_array_equal(found, normals.estimate(grown.points, grown.points, 3.5 * voxel_m))
+        np.testing.assert_array_equal(
+            found, normals.estimate(grown.points, grown.points, 3.5 * voxel_m, 0.25 * voxel_m))
 
 
 def check_nothing_thinned() -> None:
     clouds = [np.full((4, 3), value) for value in (np.nan, np.inf, 0.0, 1e12, 1e300)]
     for points in (np.empty((0, 3)), *clouds):
-        means, grown, found, _, in_range = thinning.thinned(points, 0.0, np.inf, 0.2, 0.04, 3.5)
+        means, grown, found, _, in_range = thinning.thinned(points, 0.0, np.inf, 0.2, 0.04, 3.5, 0.25)
         assert len(means) == len(grown.points) == len(found) == in_range == 0
         assert np.isnan(found).all()
 

@@ -532,6 +532,15 @@ def test_normals():
     check_normals(1500)
 
 
+def test_what_is_narrower_than_wanted_is_a_line_and_has_no_normal():
+    along = np.linspace(0.0, 1.4, 60)
+    ring = np.column_stack([along, rng(7).normal(0.0, 0.02, (60, 2))]) + [0.0, 10.0, -1.7]
+    strip = np.concatenate([ring, ring + [0.0, 0.3, 0.0]])
+    assert np.isfinite(normals.estimate(ring, ring, 0.7)).all()
+    assert np.isnan(normals.estimate(ring, ring, 0.7, min_width_m=0.05)).all()
+    assert (normals.estimate(strip, strip, 0.7, min_width_m=0.05)[:, 2] > 0.9).all()
+
+
 def test_normals_without_any_surface_are_nan():
     assert np.isnan(normals.estimate(np.ones((3, 3)), np.empty((0, 3)), 0.5)).all()
 

@@ -208,6 +208,14 @@ def test_points_that_coincide_are_no_trouble(how):
     assert np.median(error_m[truth.is_dynamic]) < 0.1 and error_m[~truth.is_dynamic].mean() < 0.03
 
 
+@pytest.mark.parametrize("step_m", [0.02, 0.05])
+def test_rounded_rings_on_an_open_road_are_no_surfaces_that_travel_with_the_sensor(step_m):
+    pair, truth = pair_of(synthetic.one_car(8.0, rng(0)), SENSOR, 1)
+    scans = [np.round(scan.points / step_m) * step_m for scan in (pair.source, pair.target)]
+    found = ego.register(*(ego.Thinned.of(points, Config()) for points in scans))
+    assert_same_motion(found, truth.ego_motion, 0.03, 0.1)
+
+
 def test_identical_scans_do_not_flow():
     pair, _ = pair_of(synthetic.one_car(8.0, rng(1)), COARSE, 2)
     same = ScanPair(pair.source, Scan(pair.source.points.copy(), 100_000_000, "again"))

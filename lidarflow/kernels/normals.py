@@ -14,28 +14,33 @@ _ROWS = 3            # of a block: offsets along x, y, z
 _SUMS = 10           # number, offsets, and products of two of them
 
 
-def estimate(points: np.ndarray, surface: np.ndarray, radius_m: float) -> np.ndarray:
+def estimate(
+    points: np.ndarray, surface: np.ndarray, radius_m: float, min_width_m: float = 0.0
+) -> np.ndarray:
     """Unit normals (N, 3) at `points` (N, 3), fitted to `surface` (S, 3) within `radius_m`.
 
-    They face the sensor at the origin. NaN where there are too few neighbours or they lie on a line.
+    They face the sensor at the origin. NaN where there are too few neighbours or they lie on a line, as what
+    is narrower than `min_width_m`, a standard deviation, does as well.
     """
     asked, seen = cells.build(points, radius_m), cells.build(surface, radius_m)
-    return estimated(np.ascontiguousarray(points), asked, np.ascontiguousarray(surface), seen)
+    return estimated(np.ascontiguousarray(points), asked, np.ascontiguousarray(surface), seen,
+                     float(min_width_m))
 
 
 @njit(parallel=True)
-def estimated(points, asked, surface, seen):
+def estimated(points, asked, surface, seen, min_width_m):
     """As `estimate`, for other kernels: points and surface also by cells of the radius."""
     normals = np.full((len(points), 3), np.nan)
     count = len(asked.place)
     for chunk in numba.prange((count + _CHUNK - 1) // _CHUNK):
         _estimate_some(
-            points, asked, surface, seen, chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), normals)
+            points, asked, surface, seen, chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), min_width_m,
+            normals)
     return normals
 
 
 @njit()
-def _estimate_some(points, asked, surface, seen, start, end, normals):
+def _estimate_some(points, asked, surface, seen, start, end, min_width_m, normals):
     """Fill the normals (N, 3) of the points in the cells from `start` to `end`."""
     near, corner = np.empty(cells.NEAR, np.int64), np.empty(3)
     values, across = np.empty(3), np.empty(3)
@@ -45,7 +50,7 @@ def _estimate_some(points, asked, surface, seen, start, end, normals):
         for i in asked.order[asked.bounds[cell]: asked.bounds[cell + 1]]:
             _add_up(block, np.float32(points[i, 0] - corner[0]), np.float32(points[i, 1] - corner[1]),
                     np.float32(points[i, 2] - corner[2]), np.float32(seen.cell_m * seen.cell_m), sums)
-            _fit(points[i], sums, values, across, normals[i])
+            _fit(points[i], sums, min_width_m, values, across, normals[i])
 
 
 @njit()
@@ -74,7 +79,7 @@ def _add_up(block, px, py, pz, radius_sq, sums):
 
 
 @njit()
-def _fit(p, sums, values, across, normal):
+def _fit(p, sums, min_width_m, values, across, normal):
     """Fill `normal` (3,) at p (3,) from the sums over its neighbours, if it has one."""
     count = lanes.total(sums, 0)
     if count < _MIN_NEIGHBOURS:
@@ -84,7 +89,7 @@ def _fit(p, sums, values, across, normal):
         lanes.total(sums, 4) / count - mx * mx, lanes.total(sums, 5) / count - mx * my,
         lanes.total(sums, 6) / count - mx * mz, lanes.total(sums, 7) / count - my * my,
         lanes.total(sums, 8) / count - my * mz, lanes.total(sums, 9) / count - mz * mz, values, across)
-    if values[1] <= _MIN_SPREAD * values[2]:
+    if values[1] <= max(_MIN_SPREAD * values[2], min_width_m * min_width_m):
         return
     sign = -1.0 if across[0] * p[0] + across[1] * p[1] + across[2] * p[2] > 0.0 else 1.0
     for k in range(3):

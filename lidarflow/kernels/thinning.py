@@ -2,11 +2,13 @@
 
 import math
 
+import numba
 import numpy as np
 
 from lidarflow.kernels import cells, grid, normals
 from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.tree import Tree
 
 NEAREST_M = 1e-3          # nearer than this lie no returns: files have zeros where there was no echo
 FARTHEST_M = 1e4          # nor farther, whatever the limits: int32 has to do for counting cells
@@ -32,23 +34,43 @@ def in_range(points, min_range_m, max_range_m):
     return found[:count], median_m
 
 
-@njit()
-def planes(points, normal_radius_m):
-    """The tree over points (N, 3), and a normal (N, 3) at each in its order, fitted within a radius."""
-    grown = trees.grown(points)
-    near = cells.built(grown.points, normal_radius_m)
-    return grown, normals.estimated(grown.points, near, grown.points, near)
+def planes(points: np.ndarray, normal_radius_m: float, min_width_m: float) -> tuple[Tree, np.ndarray]:
+    """The tree over points (N, 3), and a normal (N, 3) at each in its order, as normals.estimate."""
+    _launch_threads()
+    return _planes(np.ascontiguousarray(points), float(normal_radius_m), float(min_width_m))
 
 
-@njit()
-def thinned(points, min_range_m, max_range_m, voxel_m, scene_share, radius_voxels):
+def thinned(
+    points: np.ndarray, min_range_m: float, max_range_m: float, voxel_m: float, scene_share: float,
+    radius_voxels: float, width_voxels: float,
+) -> tuple[np.ndarray, Tree, np.ndarray, float, int]:
     """What is in range of points (N, 3), averaged per voxel (M, 3), and its `planes`.
 
-    Returns the voxel in metres and how many points were in range as well.
-    A voxel is at most `scene_share` of the median range, normals are fitted within `radius_voxels` of them.
+    Returns the voxel in metres and how many points were in range as well. A voxel is at most `scene_share` of
+    the median range; normals are fitted within `radius_voxels`, to what is as wide as `width_voxels`.
     """
+    _launch_threads()
+    return _thinned(
+        np.ascontiguousarray(points), float(min_range_m), float(max_range_m), float(voxel_m), scene_share,
+        radius_voxels, width_voxels)
+
+
+def _launch_threads() -> None:
+    # A kernel that comes from the cache does not launch those that a kernel within it needs.
+    numba.get_num_threads()
+
+
+@njit()
+def _planes(points, normal_radius_m, min_width_m):
+    grown = trees.grown(points)
+    near = cells.built(grown.points, normal_radius_m)
+    return grown, normals.estimated(grown.points, near, grown.points, near, min_width_m)
+
+
+@njit()
+def _thinned(points, min_range_m, max_range_m, voxel_m, scene_share, radius_voxels, width_voxels):
     kept, median_m = in_range(points, min_range_m, max_range_m)
     voxel_m = min(voxel_m, scene_share * median_m)
     means = grid.averaged(kept, voxel_m) if voxel_m > 0.0 else kept
-    grown, found = planes(means, max(radius_voxels * voxel_m, _LEAST_RADIUS_M))
+    grown, found = _planes(means, max(radius_voxels * voxel_m, _LEAST_RADIUS_M), width_voxels * voxel_m)
     return means, grown, found, voxel_m, len(kept)

@@ -14,6 +14,9 @@ from lidarflow.open3d_import import open3d
 
 _SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range: indoors all is smaller
 _NORMAL_RADIUS_VOXELS = 3.5
+# A piece of one ring on the road is as wide as ranges are noisy, and its normal points anywhere across it:
+# such planes travel with the sensor. What is narrower than this, as a standard deviation, has none.
+_MIN_WIDTH_VOXELS = 0.25
 _MIN_POINTS = 30
 _SETTLED = 1e-5              # a step that stays below it, in metres and radians, ends a registration
 _NEARLY_SETTLED = 1e-4       # and that ends a stage another one follows
@@ -59,7 +62,8 @@ class Planes:
     @classmethod
     def of(cls, points: np.ndarray, voxel_m: float) -> "Planes":
         """Of points (N, 3) in metres, thinned to `voxel_m`."""
-        return cls(*thinning.planes(np.ascontiguousarray(points), _NORMAL_RADIUS_VOXELS * voxel_m))
+        return cls(*thinning.planes(
+            points, _NORMAL_RADIUS_VOXELS * voxel_m, _MIN_WIDTH_VOXELS * voxel_m))
 
     @classmethod
     def in_range(
@@ -70,8 +74,8 @@ class Planes:
         Raises DataError where too few are left.
         """
         means, tree, normals, voxel_m, count = thinning.thinned(
-            np.ascontiguousarray(points), limits.min_range_m, limits.max_range_m, wanted_m,
-            _SCENE_VOXEL_SHARE, _NORMAL_RADIUS_VOXELS)
+            points, limits.min_range_m, limits.max_range_m, wanted_m, _SCENE_VOXEL_SHARE,
+            _NORMAL_RADIUS_VOXELS, _MIN_WIDTH_VOXELS)
         _require_enough(means, count, voxel_m)
         return means, cls(tree, normals), voxel_m
 
