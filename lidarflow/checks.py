@@ -1,8 +1,37 @@
-"""What the frozen data types check at their door; ValueErrors that say what was expected and found."""
+"""What the frozen data types check at their door; ValueErrors that say what was expected and found.
+
+What programs hand over, such as points, is an InputError, which is a LidarflowError too.
+"""
+
+import os
+from typing import Any
 
 import numpy as np
 
 from lidarflow import pose
+from lidarflow.errors import InputError
+
+
+def as_points(name: str, points: Any) -> np.ndarray:
+    """Points (N, 3) float64 of any numbers, which are not copied where they are that already.
+
+    Raises InputError, which calls the points `name`, for anything else.
+    """
+    expected = "expected points (N, 3)"
+    if isinstance(points, str | os.PathLike):
+        raise InputError(f"{name}: the path {os.fspath(points)!r}; {expected}, "
+                         "lidarflow.read_scan reads them from a file")
+    try:
+        found = np.asarray(points)
+    except (TypeError, ValueError, RuntimeError) as error:
+        kind = type(points).__name__
+        raise InputError(f"{name}: a {kind} that is no array ({error}); {expected}") from None
+    if found.dtype.kind == "O":
+        raise InputError(f"{name}: of type {type(points).__name__}; {expected}")
+    if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in "fiu":
+        raise InputError(f"{name}: an array {found.shape} of {found.dtype}; {expected}; "
+                         "where rows have more columns, pass points[:, :3]")
+    return np.ascontiguousarray(found, np.float64)
 
 
 def check(name: str, array: np.ndarray, shape: tuple, kind: str) -> None:

@@ -20,6 +20,10 @@ class DataError(LidarflowError):
     """A file or a scan cannot be used as it is."""
 
 
+class InputError(DataError, ValueError):
+    """What a program hands over is no scan, frame or camera; also the ValueError that Python would raise."""
+
+
 class SolveError(LidarflowError):
     """The optimiser could not produce an answer for a well-formed problem."""
 

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.checks import check, check_motion
-from lidarflow.errors import DataError
+from lidarflow.checks import as_points, check, check_motion
 from lidarflow.rows import without_gaps
 
 _FILLED_IN: Any = None     # the default of an array that __post_init__ makes in the length of the others
@@ -22,7 +21,7 @@ _FILLED_IN: Any = None     # the default of an array that __post_init__ makes in
 class Scan:
     """One LiDAR sweep in its own sensor frame.
 
-    points   (N, 3) float64   metres; NaN rows are allowed and stay NaN in every result
+    points   (N, 3) float64   metres, given as any numbers; NaN rows are allowed and stay NaN in every result
     time_ns  int              start of the sweep
     name     str              what messages and files call it, e.g. "000042"
     """
@@ -32,8 +31,7 @@ class Scan:
     name: str = "scan"
 
     def __post_init__(self):
-        check(f"{self.name}: points", self.points, (None, 3), "f")
-        object.__setattr__(self, "points", np.ascontiguousarray(self.points, np.float64))
+        object.__setattr__(self, "points", as_points(self.name, self.points))
 
     def __len__(self) -> int:
         return len(self.points)
@@ -42,15 +40,13 @@ class Scan:
 def as_scan(scan: Scan | np.ndarray, name: str = "scan") -> Scan:
     """A Scan as it is; points (N, 3) of any numbers, metres in the sensor frame, as a Scan without a time.
 
-    Raises DataError, which calls the points `name`, for anything else.
+    Raises InputError, which calls the points `name`, for anything else.
     """
     if isinstance(scan, Scan):
         return scan
-    points = np.asarray(scan)
-    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        raise DataError(f"{name}: an array {points.shape} of {points.dtype}; expected points (N, 3); "
-                        "where rows have more columns, pass points[:, :3]")
-    return Scan(points.astype(np.float64), name=name)
+    made = Scan(scan, name=name)
+    # Whose points they are may write the next scan into them.
+    return replace(made, points=made.points.copy()) if np.may_share_memory(made.points, scan) else made
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import types
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,11 +61,27 @@ def test_a_stream_of_arrays_is_a_stream_of_scans():
     assert np.median(error_m[~truth.is_dynamic]) < 0.03
 
 
-@pytest.mark.parametrize("points, found", [
+NO_POINTS = [
     (np.zeros((5, 4)), "source: an array (5, 4) of float64; expected points (N, 3)"),
     (np.zeros(3), "an array (3,) of float64"),
     (np.array([["a", "b", "c"]]), "an array (1, 3) of <U1"),
+    (np.zeros((4, 3), bool), "an array (4, 3) of bool"),
     ([[1, 2], [3, 4]], "an array (2, 2) of int64"),
+    ([[1, 2, 3], [4, 5]], "source: a list that is no array"),
+    (None, "source: of type NoneType; expected points (N, 3)"),
+    ("scan0.bin", "source: the path 'scan0.bin'; expected points (N, 3), lidarflow.read_scan reads them"),
+    (Path("scan0.bin"), "the path 'scan0.bin'")]
+
+
+@pytest.mark.parametrize("points, found", NO_POINTS)
+def test_no_scan_is_made_of_what_is_no_points(points, found):
+    with pytest.raises(lidarflow.LidarflowError) as caught:
+        Scan(points, name="source")
+    assert found in str(caught.value) and isinstance(caught.value, ValueError)
+
+
+@pytest.mark.parametrize("points, found", [
+    *NO_POINTS,
     (np.zeros((4, 3)), "none of 4 points lies between"),
     (np.empty((0, 3)), "none of 0 points lies between"),
     (np.full((4, 3), np.nan), "none of 4 points lies between")])
@@ -77,6 +94,15 @@ def test_arrays_that_are_no_points(points, found):
 def test_whole_numbers_are_points():
     scan = as_scan(np.array([[1, 2, 3]]), "mine")
     assert scan.points.dtype == np.float64 and scan.name == "mine" and as_scan(scan) is scan
+    np.testing.assert_array_equal(Scan([[1, 2, 3]]).points, scan.points)
+
+
+def test_a_stream_may_be_in_one_array_that_is_overwritten():
+    points = clouds()[0].copy()
+    assert Scan(points).points is points, "nothing is copied that need not be"
+    scan = as_scan(points)
+    points[:] = 0.0
+    np.testing.assert_array_equal(scan.points, clouds()[0])
 
 
 def test_after_a_bad_scan_the_stream_goes_on():
