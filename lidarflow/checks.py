@@ -10,19 +10,20 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.errors import InputError
+from lidarflow.rows import with_whole_gaps
 
 
 def as_points(name: str, points: Any) -> np.ndarray:
-    """Points (N, 3) float64 of any numbers, which are not copied where they are that already.
+    """Points (N, 3) float64 of any numbers; what is not finite, or masked, in part is a NaN row.
 
-    Raises InputError, which calls the points `name`, for anything else.
+    What is that already is not copied. Raises InputError, which calls the points `name`, for anything else.
     """
     expected = "expected points (N, 3)"
     if isinstance(points, str | os.PathLike):
         raise InputError(f"{name}: the path {os.fspath(points)!r}; {expected}, "
                          "lidarflow.read_scan reads them from a file")
     try:
-        found = np.asarray(points)
+        found = np.asanyarray(points)     # keeps a mask
     except (TypeError, ValueError, RuntimeError) as error:
         kind = type(points).__name__
         raise InputError(f"{name}: a {kind} that is no array ({error}); {expected}") from None
@@ -31,7 +32,10 @@ def as_points(name: str, points: Any) -> np.ndarray:
     if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in "fiu":
         raise InputError(f"{name}: an array {found.shape} of {found.dtype}; {expected}; "
                          "where rows have more columns, pass points[:, :3]")
-    return np.ascontiguousarray(found, np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):     # a signalling NaN is a NaN
+        if isinstance(found, np.ma.MaskedArray):
+            found = np.ma.filled(found.astype(np.float64), np.nan)
+        return with_whole_gaps(np.ascontiguousarray(found, np.float64))
 
 
 def check(name: str, array: np.ndarray, shape: tuple, kind: str) -> None:

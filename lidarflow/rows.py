@@ -18,6 +18,18 @@ def are_finite(vectors: np.ndarray) -> np.ndarray:
     return np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
 
 
+def with_whole_gaps(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (N, 3) where those that are not finite are NaN as a whole: themselves, or a copy if need be."""
+    if np.isfinite(vectors).all():
+        return vectors
+    gaps = np.flatnonzero(~are_finite(vectors))
+    if np.isnan(vectors.take(gaps, axis=0)).all():
+        return vectors
+    vectors = vectors.copy()
+    vectors[gaps] = np.nan
+    return vectors
+
+
 def mean(vectors: np.ndarray) -> np.ndarray:
     """The mean (3,) of vectors (N, 3), at least one."""
     return np.einsum("ij->j", vectors) / len(vectors)

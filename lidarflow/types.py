@@ -21,7 +21,8 @@ _FILLED_IN: Any = None     # the default of an array that __post_init__ makes in
 class Scan:
     """One LiDAR sweep in its own sensor frame.
 
-    points   (N, 3) float64   metres, given as any numbers; NaN rows are allowed and stay NaN in every result
+    points   (N, 3) float64   metres, given as any numbers; rows that are not finite, or masked, become NaN
+                              rows, which stay NaN in every result
     time_ns  int              start of the sweep
     name     str              what messages and files call it, e.g. "000042"
     """

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 import types
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -95,6 +96,31 @@ def test_whole_numbers_are_points():
     scan = as_scan(np.array([[1, 2, 3]]), "mine")
     assert scan.points.dtype == np.float64 and scan.name == "mine" and as_scan(scan) is scan
     np.testing.assert_array_equal(Scan([[1, 2, 3]]).points, scan.points)
+
+
+def test_rows_that_are_masked_or_not_finite_are_nan_rows():
+    source, target = clouds()[:2]
+    masked = np.ma.masked_array(source.astype(np.float32), mask=False)
+    masked[3, 1] = np.ma.masked
+    broken = source.astype(np.float32)
+    broken[3] = 1.0, np.inf, np.nan
+    gap = source.astype(np.float32)
+    gap[3] = np.nan
+    assert np.isnan(Scan(masked).points).all(axis=1).nonzero()[0].tolist() == [3]
+    assert np.isfinite(Scan(np.ma.masked_array(source)).points).all()
+    assert np.isinf(broken[3, 1]), "what is given is not written to"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        flows = [lidarflow.estimate_flow((points, target), FAST).flow for points in (masked, broken, gap)]
+        lidarflow.estimate_flow((source, broken), FAST)
+    np.testing.assert_array_equal(flows[0], flows[2])
+    np.testing.assert_array_equal(flows[1], flows[2])
+    assert np.isnan(flows[0][3]).all() and np.isfinite(flows[0][2]).all()
+
+
+def test_masked_whole_numbers_have_gaps_too():
+    points = np.ma.masked_array(np.ones((2, 3), np.int32), mask=[[False] * 3, [True, False, False]])
+    np.testing.assert_array_equal(Scan(points).points, [[1, 1, 1], [np.nan] * 3])
 
 
 def test_a_stream_may_be_in_one_array_that_is_overwritten():
