@@ -12,6 +12,8 @@ from lidarflow import pose
 from lidarflow.errors import InputError
 from lidarflow.rows import with_whole_gaps
 
+_NS_LIMIT = 2**63
+
 
 def as_points(name: str, points: Any) -> np.ndarray:
     """Points (N, 3) float64 of any numbers; what is not finite, or masked, in part is a NaN row.
@@ -36,6 +38,15 @@ def as_points(name: str, points: Any) -> np.ndarray:
         if isinstance(found, np.ma.MaskedArray):
             found = np.ma.filled(found.astype(np.float64), np.nan)
         return with_whole_gaps(np.ascontiguousarray(found, np.float64))
+
+
+def as_time_ns(name: str, time_ns: Any) -> int:
+    """A time in nanoseconds as a Python int, which cannot overflow; InputError unless it is whole."""
+    is_whole = isinstance(time_ns, int | np.integer) and not isinstance(time_ns, bool)
+    if not is_whole or not -_NS_LIMIT <= time_ns < _NS_LIMIT:
+        raise InputError(f"{name}: time_ns is {time_ns!r}; expected whole nanoseconds in 64 bits, "
+                         "such as round(seconds * 1e9)")
+    return int(time_ns)
 
 
 def check(name: str, array: np.ndarray, shape: tuple, kind: str) -> None:

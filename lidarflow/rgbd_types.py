@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.checks import check, check_motion
+from lidarflow.checks import as_time_ns, check, check_motion
 
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)     # ITU-R BT.601
 
@@ -79,6 +79,7 @@ class RgbdFrame:
     color: np.ndarray | None = None
 
     def __post_init__(self):
+        object.__setattr__(self, "time_ns", as_time_ns(self.name, self.time_ns))
         check(f"{self.name}: intensity", self.intensity, (None, None), "f")
         check(f"{self.name}: depth", self.depth, self.intensity.shape, "f")
         if self.color is not None:

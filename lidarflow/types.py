@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.checks import as_points, check, check_motion
+from lidarflow.checks import as_points, as_time_ns, check, check_motion
 from lidarflow.rows import without_gaps
 
 _FILLED_IN: Any = None     # the default of an array that __post_init__ makes in the length of the others
@@ -33,6 +33,7 @@ class Scan:
 
     def __post_init__(self):
         object.__setattr__(self, "points", as_points(self.name, self.points))
+        object.__setattr__(self, "time_ns", as_time_ns(self.name, self.time_ns))
 
     def __len__(self) -> int:
         return len(self.points)

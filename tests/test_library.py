@@ -17,6 +17,7 @@ from shared_data import ROOT
 import lidarflow
 from lidarflow import datasets, pipeline
 from lidarflow.config import Config
+from lidarflow.rgbd_types import RgbdFrame
 from lidarflow.types import Scan, ScanPair, as_scan
 
 FAST = lidarflow.load(overrides=("solver.method=fast",))
@@ -121,6 +122,23 @@ def test_rows_that_are_masked_or_not_finite_are_nan_rows():
 def test_masked_whole_numbers_have_gaps_too():
     points = np.ma.masked_array(np.ones((2, 3), np.int32), mask=[[False] * 3, [True, False, False]])
     np.testing.assert_array_equal(Scan(points).points, [[1, 1, 1], [np.nan] * 3])
+
+
+NO_TIMES = ["x", float("nan"), 1.5, None, True, np.bool_(True), np.datetime64(5, "ns"), 2**63]
+
+
+@pytest.mark.parametrize("time_ns", NO_TIMES)
+def test_times_are_whole_nanoseconds(time_ns):
+    image = np.full((2, 2), 0.5)
+    for made in (lambda: Scan(np.zeros((1, 3)), time_ns), lambda: RgbdFrame(image, image, time_ns)):
+        with pytest.raises(lidarflow.LidarflowError, match=r"time_ns is .* whole nanoseconds.*seconds"):
+            made()
+
+
+def test_times_without_a_sign_may_go_backwards():
+    early, late = (Scan(np.zeros((1, 3)), np.uint64(time_ns)) for time_ns in (10**9, 3 * 10**9))
+    assert type(early.time_ns) is int
+    assert ScanPair(early, late).dt_s == 2.0 and ScanPair(late, early).dt_s == 0.1
 
 
 def test_a_stream_may_be_in_one_array_that_is_overwritten():
