@@ -32,7 +32,7 @@ from lidarflow.lidar.tracking import Tracks
 from lidarflow.rows import lengths
 from lidarflow.solve import solve
 from lidarflow.stopwatch import Stopwatch
-from lidarflow.types import FlowResult, Scan, ScanPair, as_scan
+from lidarflow.types import FlowResult, Scan, ScanPair, as_pair, as_scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,12 +77,9 @@ def estimate_flow(
 
     Scans without times are taken 0.1 s apart. Raises DataError for scans that cannot be used.
     """
-    config = config or Config()
-    if not isinstance(pair, ScanPair):
-        source, target = pair
-        pair = ScanPair(as_scan(source, "source"), as_scan(target, "target"))
+    scans, config = as_pair(pair), config or Config()
     with Aside() as beside:
-        result, _ = explain(prepare(pair, config, beside), config, beside)
+        result, _ = explain(prepare(scans, config, beside), config, beside)
     return result
 
 

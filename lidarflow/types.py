@@ -12,6 +12,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.checks import as_points, as_time_ns, check, check_motion
+from lidarflow.errors import InputError
 from lidarflow.rows import without_gaps
 
 _FILLED_IN: Any = None     # the default of an array that __post_init__ makes in the length of the others
@@ -53,16 +54,36 @@ def as_scan(scan: Scan | np.ndarray, name: str = "scan") -> Scan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPair:
-    """Two consecutive scans; the flow carries `source` onto `target`."""
+    """Two consecutive scans, or points (N, 3) that become scans; the flow carries `source` onto `target`."""
 
     source: Scan
     target: Scan
+
+    def __post_init__(self):
+        object.__setattr__(self, "source", as_scan(self.source, "source"))
+        object.__setattr__(self, "target", as_scan(self.target, "target"))
 
     @property
     def dt_s(self) -> float:
         """Seconds from source to target; 0.1 (a 10 Hz sensor) where the times do not say."""
         dt = (self.target.time_ns - self.source.time_ns) * 1e-9
         return dt if dt > 0 else 0.1
+
+
+def as_pair(pair: Any) -> ScanPair:
+    """A ScanPair as it is, or one of a source and a target; InputError for anything but two scans."""
+    if isinstance(pair, ScanPair):
+        return pair
+    expected = "expected two scans, as in estimate_flow((source, target))"
+    if isinstance(pair, np.ndarray) and pair.ndim != 3:
+        raise InputError(f"pair: one array {pair.shape}; {expected}")
+    try:
+        scans = tuple(pair)
+    except TypeError:
+        raise InputError(f"pair: of type {type(pair).__name__}; {expected}") from None
+    if len(scans) != 2:
+        raise InputError(f"pair: {len(scans)} in a {type(pair).__name__}; {expected}")
+    return ScanPair(*scans)
 
 
 class Category(IntEnum):

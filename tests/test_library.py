@@ -18,7 +18,7 @@ import lidarflow
 from lidarflow import datasets, pipeline
 from lidarflow.config import Config
 from lidarflow.rgbd_types import RgbdFrame
-from lidarflow.types import Scan, ScanPair, as_scan
+from lidarflow.types import Scan, ScanPair, as_pair, as_scan
 
 FAST = lidarflow.load(overrides=("solver.method=fast",))
 
@@ -50,6 +50,35 @@ def test_arrays_and_scans_give_the_same_flow():
     of_scans = lidarflow.estimate_flow(pair, FAST)
     np.testing.assert_array_equal(of_arrays.flow, of_scans.flow)
     assert of_arrays.flow.shape == source.shape and of_arrays.flow.dtype == np.float64
+
+
+def test_two_clouds_are_a_pair_however_they_come():
+    source, target = clouds()[:2]
+    there = [lidarflow.estimate_flow(pair, FAST).flow for pair in (
+        (source, target), [Scan(source), target], ScanPair(source, target))]
+    np.testing.assert_array_equal(there[0], there[1])
+    np.testing.assert_array_equal(there[0], there[2])
+    assert as_pair(np.zeros((2, 5, 3))).target.points.shape == (5, 3), "two scans in one array"
+
+
+@pytest.mark.parametrize("pair, found", [
+    (np.zeros((9, 3)), "pair: one array (9, 3)"), (np.zeros((2, 3)), "pair: one array (2, 3)"),
+    (Scan(np.zeros((9, 3))), "pair: of type Scan"), (None, "pair: of type NoneType"),
+    ((np.zeros((9, 3)),) * 3, "pair: 3 in a tuple"), ([], "pair: 0 in a list")])
+def test_a_pair_is_two_scans(pair, found):
+    for more in (), (np.zeros((9, 3)),):     # the second scan is no configuration
+        with pytest.raises(lidarflow.LidarflowError) as caught:
+            lidarflow.estimate_flow(pair, *more)
+        assert str(caught.value) == f"{found}; expected two scans, as in estimate_flow((source, target))"
+
+
+@pytest.mark.parametrize("scans, found", [
+    ((np.zeros((9, 4)), np.zeros((9, 3))), "source: an array (9, 4)"),
+    ((np.zeros((9, 3)), None), "target: of type NoneType")])
+def test_a_pair_says_which_of_its_scans_is_none(scans, found):
+    for made in (lambda: ScanPair(*scans), lambda: as_pair(scans)):
+        with pytest.raises(lidarflow.LidarflowError, match=re.escape(found)):
+            made()
 
 
 def test_a_stream_of_arrays_is_a_stream_of_scans():
