@@ -220,12 +220,27 @@ def load(file: Path | str | None = None, overrides: tuple[str, ...] = (), kind: 
 
     Raises ConfigError for a file that cannot be read, an unknown key, or a value out of range.
     """
+    if isinstance(overrides, str):
+        raise ConfigError(f"overrides: the text {overrides!r}; expected several, as in ({overrides!r},)")
     config = kind()
     if file is not None:
         config = updated(config, read_toml(Path(file)), str(file))
     for override in overrides:
         config = updated(config, _parse_override(override), "--set")
     return config
+
+
+def given(config: Any, kind: type[Settings]) -> Settings:
+    """Settings of a `kind` as they are, its defaults for None; ConfigError for anything else."""
+    if config is None:
+        return kind()
+    if isinstance(config, kind):
+        return config
+    found, file = f"of type {type(config).__name__}", "file"
+    if isinstance(config, str | Path):
+        found = file = repr(str(config))
+    how = f"lidarflow.load({file})" if kind is Config else f"lidarflow.load({file}, (), {kind.__name__})"
+    raise ConfigError(f"settings: {found}; expected a {kind.__name__}, such as {how}")
 
 
 def updated(config: Settings, changes: dict, origin: str = "settings") -> Settings:

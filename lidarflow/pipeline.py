@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.aside import Aside
-from lidarflow.config import Config
+from lidarflow.config import Config, given
 from lidarflow.datasets import Dataset
 from lidarflow.lidar import (
     attribution,
@@ -77,7 +77,7 @@ def estimate_flow(
 
     Scans without times are taken 0.1 s apart. Raises DataError for scans that cannot be used.
     """
-    scans, config = as_pair(pair), config or Config()
+    scans, config = as_pair(pair), given(config, Config)
     with Aside() as beside:
         result, _ = explain(prepare(scans, config, beside), config, beside)
     return result
@@ -87,7 +87,7 @@ class FlowEstimator:
     """Flow along a sequence: motions, features and ego-motion are carried from pair to pair."""
 
     def __init__(self, config: Config | None = None):
-        self.config = config or Config()
+        self.config = given(config, Config)
         self.tracks = Tracks()
         self.reset()
 

@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 
 from lidarflow import pose
+from lidarflow.config import given
 from lidarflow.errors import DataError, SolveError
 from lidarflow.open3d_import import open3d
 from lidarflow.rgbd import RgbdEstimator, pyramid
@@ -43,7 +44,7 @@ class Open3dOdometry:
     tracks: None = None
 
     def __init__(self, camera: Camera, config: RgbdConfig | None = None):
-        self._camera, self._images = camera, (config or RgbdConfig()).images
+        self._camera, self._images = camera, given(config, RgbdConfig).images
         self.reset()
 
     def reset(self) -> None:

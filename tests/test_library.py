@@ -15,12 +15,15 @@ from command_line import drive
 from shared_data import ROOT
 
 import lidarflow
-from lidarflow import datasets, pipeline
+from lidarflow import datasets, pipeline, rgbd_methods
 from lidarflow.config import Config
-from lidarflow.rgbd_types import RgbdFrame
+from lidarflow.methods import METHODS
+from lidarflow.rgbd import RgbdEstimator
+from lidarflow.rgbd_types import Camera, RgbdFrame
 from lidarflow.types import Scan, ScanPair, as_pair, as_scan
 
 FAST = lidarflow.load(overrides=("solver.method=fast",))
+CAMERA = Camera.from_field_of_view(16, 12)
 
 
 def clouds():
@@ -184,6 +187,27 @@ def test_after_a_bad_scan_the_stream_goes_on():
     with pytest.raises(lidarflow.LidarflowError):
         estimator.step(np.zeros((4, 2)))
     assert estimator.step(clouds()[1]).flow.shape == clouds()[0].shape
+
+
+@pytest.mark.parametrize("wrong, found", [
+    ("my.toml", "'my.toml'; expected a {0}, such as lidarflow.load('my.toml'{1})"),
+    (Path("my.toml"), "'my.toml'; expected a {0}, such as lidarflow.load('my.toml'{1})"),
+    ({}, "of type dict; expected a {0}, such as lidarflow.load(file{1})")])
+@pytest.mark.parametrize("start, kind, more", [
+    (lambda config: lidarflow.estimate_flow((np.zeros((9, 3)),) * 2, config), "Config", ""),
+    (lidarflow.FlowEstimator, "Config", ""),
+    (METHODS["icp"].along, "Config", ""),
+    (lambda config: RgbdEstimator(CAMERA, config), "RgbdConfig", ", (), RgbdConfig"),
+    (lambda config: rgbd_methods.Open3dOdometry(CAMERA, config), "RgbdConfig", ", (), RgbdConfig")])
+def test_settings_are_no_file(wrong, found, start, kind, more):
+    with pytest.raises(lidarflow.LidarflowError) as caught:
+        start(wrong)
+    assert str(caught.value) == "settings: " + found.format(kind, more)
+
+
+def test_overrides_are_several():
+    with pytest.raises(lidarflow.LidarflowError, match=r"expected several, as in \('solver.method=fast',\)"):
+        lidarflow.load(overrides="solver.method=fast")
 
 
 # Types.

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.config import Config
+from lidarflow.config import Config, given
 from lidarflow.lidar import features, preparation
 from lidarflow.lidar.features import Masks
 from lidarflow.lidar.tracking import Tracks
@@ -45,7 +45,7 @@ class WholeScan(ABC):
     variables: ClassVar[int] = 1     # motions that are solved for
 
     def __init__(self, config: Config | None = None):
-        self.config = config or Config()
+        self.config = given(config, Config)
         self.tracks = Tracks()
         self.reset()
 

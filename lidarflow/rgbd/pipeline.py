@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from lidarflow.config import given
 from lidarflow.kernels import cluster_images
 from lidarflow.rgbd import clusters as geometric
 from lidarflow.rgbd import odometry, propagation, pyramid, refinement, segmentation
@@ -17,7 +18,7 @@ def estimate_flow(
 
     `previous` is the result of the pair that ended with this pair's source, if there is one.
     """
-    config = config or RgbdConfig()
+    config = given(config, RgbdConfig)
     timed = Stopwatch()
     with timed("pyramid"):
         source, target = (pyramid.build(frame, pair.camera, config.images)
@@ -32,7 +33,7 @@ class RgbdEstimator:
 
     def __init__(self, camera: Camera, config: RgbdConfig | None = None):
         self.camera = camera
-        self.config = config or RgbdConfig()
+        self.config = given(config, RgbdConfig)
         self.reset()
 
     def reset(self) -> None:
