@@ -11,7 +11,7 @@ from shared_data import SHARED, needs_shared
 from lidarflow import pose
 from lidarflow.datasets import LOADERS, guess_loader, loader_names, open_dataset
 from lidarflow.datasets.kitti_correction import correct_vertical_angle
-from lidarflow.errors import DataError, InstallError
+from lidarflow.errors import ConfigError, DataError, InstallError
 
 # --- folders ---
 
@@ -113,6 +113,8 @@ def test_kitti_poses_are_those_of_the_lidar(tmp_path):
         np.testing.assert_allclose(data.world_from_sensor(), world_from_lidar, atol=1e-9)
         np.testing.assert_allclose(data.scan(0).points, correct_vertical_angle(POINTS))
         assert data.note == "KITTI vertical-angle correction on"
+    with pytest.raises(ConfigError, match="kitti_correction: expected one of auto, on, off, got 'no'"):
+        open_dataset(tmp_path, kitti_correction="no")
     off = open_dataset(tmp_path, kitti_correction="off")
     np.testing.assert_allclose(off.scan(0).points, POINTS)
     assert off.note == ""
@@ -135,6 +137,9 @@ def test_kitti_sequences_are_chosen(tmp_path):
     make_odometry(tmp_path, sequence="07")
     assert "holds the sequences 00, 07; choose one with --sequence" in message(open_dataset, tmp_path)
     assert open_dataset(tmp_path, sequence="7").name == "kitti 07"
+    for number in 0, np.int64(0):
+        data = open_dataset(tmp_path, sequence=number)
+        assert data.name == "kitti 00" and data.source.sequence == "0", "a run's files name it by a text"
     assert "no sequence '3'; there is 00, 07" in message(open_dataset, tmp_path, sequence="3")
     one = tmp_path / "sequences" / "07"
     assert "is the sequence '07', not '3'" in message(open_dataset, one, sequence="3")

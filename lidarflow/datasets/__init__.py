@@ -29,10 +29,11 @@ _RECORDINGS = ("ouster", "velodyne")     # one file; all other loaders of ours w
 _BY_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".db3": "rosbag", ".osf": "ouster"}
 
 
-def open_dataset(folder: Path | str, dataloader: str | None = None, sequence: str | None = None,
-                 kitti_correction: str = "auto") -> Dataset:
+def open_dataset(folder: Path | str, dataloader: str | None = None,
+                 sequence: str | int | None = None, kitti_correction: str = "auto") -> Dataset:
     """The data set in `folder`, by the named loader or by what lies in it.
 
+    sequence          its name, or a number: KITTI's "00" is 0
     kitti_correction  "auto" = on for KITTI data, "on" or "off"
 
     Raises DataError for a folder that is missing, empty or holds nothing readable, and for an unknown
@@ -46,8 +47,9 @@ def open_dataset(folder: Path | str, dataloader: str | None = None, sequence: st
     if dataloader in (None, "kitti", "kitti_raw"):
         dataloader = dataloader or guess_loader(folder)
         folder = _data_root(folder)
-    dataset = _opened(folder, dataloader, sequence, kitti_correction)
-    dataset.source = Source(folder.resolve(), dataloader, sequence, kitti_correction)
+    name = None if sequence is None else str(sequence)
+    dataset = _opened(folder, dataloader, name, kitti_correction)
+    dataset.source = Source(folder.resolve(), dataloader, name, kitti_correction)
     return dataset
 
 

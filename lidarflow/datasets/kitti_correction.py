@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from lidarflow.errors import ConfigError
+
 
 def correct_vertical_angle(points: np.ndarray) -> np.ndarray:
     """A copy of `points` (N, 3), metres, raised by the 0.205 degrees that KITTI's calibration lacks.
@@ -21,4 +23,7 @@ def correct_vertical_angle(points: np.ndarray) -> np.ndarray:
 
 def is_wanted(setting: str, is_kitti: bool) -> bool:
     """Whether the setting "auto", "on" or "off" asks for the correction of data that is KITTI's or not."""
-    return {"auto": is_kitti, "on": True, "off": False}[setting]
+    wanted = {"auto": is_kitti, "on": True, "off": False}
+    if setting not in wanted:
+        raise ConfigError(f"kitti_correction: expected one of {', '.join(wanted)}, got {setting!r}")
+    return wanted[setting]
