@@ -42,11 +42,23 @@ def as_points(name: str, points: Any) -> np.ndarray:
 
 def as_time_ns(name: str, time_ns: Any) -> int:
     """A time in nanoseconds as a Python int, which cannot overflow; InputError unless it is whole."""
-    is_whole = isinstance(time_ns, int | np.integer) and not isinstance(time_ns, bool)
-    if not is_whole or not -_NS_LIMIT <= time_ns < _NS_LIMIT:
+    if not is_whole(time_ns) or not -_NS_LIMIT <= time_ns < _NS_LIMIT:
         raise InputError(f"{name}: time_ns is {time_ns!r}; expected whole nanoseconds in 64 bits, "
                          "such as round(seconds * 1e9)")
     return int(time_ns)
+
+
+def is_whole(number: Any) -> bool:
+    """Whether something is an integer of Python or numpy, which truth values are not."""
+    return isinstance(number, int | np.integer) and not isinstance(number, bool)
+
+
+def check_given(name: str, array: Any, shape: tuple, kind: str, expected: str) -> None:
+    """As `check`, of what a program hands over: raises InputError, which says what is `expected`."""
+    try:
+        check(name, array, shape, kind)
+    except ValueError as error:
+        raise InputError(f"{error}; pass {expected}") from None
 
 
 def check(name: str, array: np.ndarray, shape: tuple, kind: str) -> None:
@@ -61,6 +73,8 @@ def check(name: str, array: np.ndarray, shape: tuple, kind: str) -> None:
         raise ValueError(f"{name}: expected shape {wanted}, got {array.shape}")
     if array.dtype.kind not in kind:
         raise ValueError(f"{name}: expected dtype kind {kind!r}, got {array.dtype}")
+    if np.ma.is_masked(array):
+        raise ValueError(f"{name}: expected no mask, got {np.ma.count_masked(array)} masked values")
 
 
 def check_motion(name: str, motion: np.ndarray) -> None:

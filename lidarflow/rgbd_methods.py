@@ -10,7 +10,7 @@ from lidarflow.errors import DataError, SolveError
 from lidarflow.open3d_import import open3d
 from lidarflow.rgbd import RgbdEstimator, pyramid
 from lidarflow.rgbd_config import RgbdConfig
-from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult
+from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult, check_is
 from lidarflow.stopwatch import Stopwatch
 
 OURS = "ours"
@@ -44,6 +44,7 @@ class Open3dOdometry:
     tracks: None = None
 
     def __init__(self, camera: Camera, config: RgbdConfig | None = None):
+        check_is("camera", camera, Camera)
         self._camera, self._images = camera, given(config, RgbdConfig).images
         self.reset()
 

@@ -6,12 +6,20 @@ A camera looks along z, x to the right, y down. Lengths are metres, times intege
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from lidarflow import pose
-from lidarflow.checks import as_time_ns, check, check_motion
+from lidarflow.checks import as_time_ns, check, check_given, check_motion, is_whole
+from lidarflow.errors import InputError
 
+_INTENSITY = "floats from 0 = black to 1 = white, such as grey / 255"
+_DEPTH = "metres along z as floats, such as pixels / 5000, and 0 where there is no reading"
+_COLOR = "RGB (H, W, 3) as uint8"
+_MADE_BY = {"Camera": "Camera(width, height, fx, fy, cx, cy)",
+            "RgbdFrame": "RgbdFrame.from_color(color, depth)",
+            "RgbdPair": "RgbdPair(source, target, camera)"}
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)     # ITU-R BT.601
 
 
@@ -32,16 +40,21 @@ class Camera:
     cy: float
 
     def __post_init__(self):
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"Camera: expected a positive size, got {self.width}x{self.height}")
-        if not all(math.isfinite(value) for value in (self.fx, self.fy, self.cx, self.cy)):
-            raise ValueError(f"Camera: expected finite numbers, got {self}")
+        for name in ("width", "height"):
+            pixels = getattr(self, name)
+            if not is_whole(pixels) or pixels < 1:
+                raise InputError(f"Camera: {name} is {pixels!r}; expected a positive whole number")
+            object.__setattr__(self, name, int(pixels))
+        for name in ("fx", "fy", "cx", "cy"):
+            object.__setattr__(self, name, _finite(f"Camera: {name}", getattr(self, name)))
         if self.fx <= 0 or self.fy <= 0:
-            raise ValueError(f"Camera: expected positive focal lengths, got {self.fx}, {self.fy}")
+            raise InputError(f"Camera: expected positive focal lengths, got {self.fx}, {self.fy}")
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal_deg: float = 62.5) -> "Camera":
         """A camera with square pixels and its centre at ((W−1)/2, (H−1)/2); 62.5° is a PrimeSense's."""
+        if not 0 < _finite("Camera: horizontal_deg", horizontal_deg) < 180:
+            raise InputError(f"Camera: {horizontal_deg} degrees wide; expected more than 0 and less than 180")
         focal = width / (2.0 * math.tan(math.radians(horizontal_deg) / 2.0))
         return cls(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0)
 
@@ -66,7 +79,7 @@ class RgbdFrame:
     """One registered image of intensity and depth.
 
     intensity  (H, W) float32           0 = black, 1 = white
-    depth      (H, W) float32           metres along z, 0 = no reading
+    depth      (H, W) float32           metres along z, 0 = no reading, as what is masked becomes
     time_ns    int
     name       str                      what messages and files call it
     color      (H, W, 3) uint8 or None  RGB, for pictures only
@@ -80,22 +93,21 @@ class RgbdFrame:
 
     def __post_init__(self):
         object.__setattr__(self, "time_ns", as_time_ns(self.name, self.time_ns))
-        check(f"{self.name}: intensity", self.intensity, (None, None), "f")
-        check(f"{self.name}: depth", self.depth, self.intensity.shape, "f")
+        intensity = _image(f"{self.name}: intensity", self.intensity, (None, None), _INTENSITY)
+        if intensity.max(initial=0) > 1:
+            raise InputError(f"{self.name}: intensity: up to {intensity.max():g}; pass {_INTENSITY}")
+        is_masked = isinstance(self.depth, np.ma.MaskedArray)
+        depth = self.depth.filled(0) if is_masked else self.depth
+        object.__setattr__(self, "intensity", intensity)
+        object.__setattr__(self, "depth", _image(f"{self.name}: depth", depth, intensity.shape, _DEPTH))
         if self.color is not None:
-            check(f"{self.name}: color", self.color, (*self.intensity.shape, 3), "u")
-        for name in ("intensity", "depth"):
-            image = np.ascontiguousarray(getattr(self, name), np.float32)
-            if not np.isfinite(image).all() or (image < 0).any():
-                raise ValueError(f"{self.name}: {name} must be finite and not negative")
-            object.__setattr__(self, name, image)
-        if self.intensity.size and self.intensity.max() > 1:
-            raise ValueError(f"{self.name}: intensity must lie in 0 .. 1, got {self.intensity.max():g}")
+            _check_color(f"{self.name}: color", self.color, intensity.shape)
 
     @classmethod
     def from_color(cls, color: np.ndarray, depth: np.ndarray, time_ns: int = 0,
                    name: str = "frame") -> "RgbdFrame":
         """A frame of an RGB image (H, W, 3) uint8, whose luma is its intensity, and depth (H, W) [m]."""
+        _check_color(f"{name}: color", color, (None, None))
         intensity = np.clip(color.astype(np.float32) / 255.0 @ _LUMA, 0.0, 1.0)
         return cls(intensity, depth, time_ns, name, color)
 
@@ -113,10 +125,13 @@ class RgbdPair:
     camera: Camera
 
     def __post_init__(self):
-        for frame in (self.source, self.target):
+        check_is("camera", self.camera, Camera)
+        for name in ("source", "target"):
+            frame = getattr(self, name)
+            check_is(name, frame, RgbdFrame)
             height, width = frame.shape
             if (height, width) != (self.camera.height, self.camera.width):
-                raise ValueError(
+                raise InputError(
                     f"{frame.name}: expected {self.camera.width}x{self.camera.height} pixels as the camera "
                     f"has, got {width}x{height}")
 
@@ -201,3 +216,32 @@ class RgbdTruth:
         check("RgbdTruth.flow", self.flow, (*self.valid.shape, 3), "f")
         check("RgbdTruth.is_dynamic", self.is_dynamic, self.valid.shape, "b")
         check_motion("RgbdTruth.odometry", self.odometry)
+
+
+def check_is(name: str, value: Any, kind: type) -> None:
+    """Raise InputError unless a value is a Camera, an RgbdFrame or an RgbdPair, whichever is the `kind`."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name}: of type {type(value).__name__}; expected {_MADE_BY[kind.__name__]}")
+
+
+def _finite(name: str, number: Any) -> float:
+    is_number = is_whole(number) or isinstance(number, float | np.floating)
+    if not is_number or not math.isfinite(number):
+        raise InputError(f"{name} is {number!r}; expected a finite number")
+    return float(number)
+
+
+def _image(name: str, values: Any, shape: tuple, expected: str) -> np.ndarray:
+    """An image (H, W) float32, finite and not negative, of what is handed over; else InputError."""
+    check_given(name, values, shape, "f", expected)
+    with np.errstate(over="ignore", invalid="ignore"):
+        image = np.ascontiguousarray(values, np.float32)
+    if not np.isfinite(image).all() or (image < 0).any():
+        raise InputError(f"{name}: must be finite and not negative; pass {expected}")
+    return image
+
+
+def _check_color(name: str, color: Any, shape: tuple) -> None:
+    check_given(name, color, (*shape, 3), "u", _COLOR)
+    if color.dtype != np.uint8:
+        raise InputError(f"{name}: of {color.dtype}; pass {_COLOR}")

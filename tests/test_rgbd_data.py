@@ -1,6 +1,9 @@
 """RGB-D images, cameras and folders from disk, and what is said of those that cannot be used."""
 
+import json
 import os
+import warnings
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -11,8 +14,10 @@ from shared_data import SHARED, needs_shared
 from lidarflow import pose, synthetic
 from lidarflow.datasets import rgbd_folders, rgbd_images, tum
 from lidarflow.datasets.rgbd_folders import CameraChoice, open_rgbd
-from lidarflow.errors import ConfigError, DataError
-from lidarflow.rgbd_types import Camera
+from lidarflow.errors import ConfigError, DataError, LidarflowError
+from lidarflow.rgbd import RgbdEstimator, estimate_flow
+from lidarflow.rgbd_methods import Open3dOdometry
+from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair
 
 MS = 1_000_000
 CAMERA = "width = 8\nheight = 6\nfx = 7.5\nfy = 7\ncx = 3.5\ncy = 2.5\n"
@@ -115,7 +120,7 @@ def test_a_camera_file(tmp_path):
                         (CAMERA.replace("height = 6", "height = true"), "height is True"),
                         (CAMERA.replace("7.5", "-1"), "positive focal"),
                         (CAMERA.replace("7.5", "inf"), "finite"),
-                        (CAMERA.replace("width = 8", "width = 0"), "positive size")):
+                        (CAMERA.replace("width = 8", "width = 0"), "width is 0; expected a positive")):
         file.write_text(text)
         with pytest.raises(DataError, match=found):
             rgbd_images.read_camera(file)
@@ -337,3 +342,64 @@ def test_real_folders(name, count, metres):
     if poses is not None:
         steps_m = pose.translation_distance(poses[:-1], poses[1:])
         assert np.isfinite(steps_m).all() and (steps_m < 0.04).all()
+
+
+# What programs hand over.
+
+GREY, METRES = np.full((12, 16), 0.5, np.float32), np.ones((12, 16), np.float32)
+COLOR = np.zeros((12, 16, 3), np.uint8)
+WIDE = Camera.from_field_of_view(16, 12)
+
+
+def a_frame():
+    return RgbdFrame(GREY, METRES)
+
+
+@pytest.mark.parametrize("made, said", [
+    (lambda: RgbdFrame(GREY.tolist(), METRES), "intensity: expected a numpy array, got list; pass floats"),
+    (lambda: RgbdFrame(COLOR[..., 0], METRES), "intensity: .* got uint8; pass .* grey / 255"),
+    (lambda: RgbdFrame(GREY * 3, METRES), "intensity: up to 1.5; pass .* grey / 255"),
+    (lambda: RgbdFrame(np.ma.masked_greater(GREY, 0), METRES), "intensity: expected no mask, got 192 masked"),
+    (lambda: RgbdFrame(GREY, METRES.astype(np.uint16)), "depth: .* got uint16; pass metres .* pixels / 5000"),
+    (lambda: RgbdFrame(GREY, METRES * np.nan), "depth: must be finite .* 0 where there is no reading"),
+    (lambda: RgbdFrame(GREY, METRES.astype(float) * 1e300), "depth: must be finite"),
+    (lambda: RgbdFrame(GREY, METRES[:3]), r"depth: expected shape \(12, 16\), got \(3, 16\)"),
+    (lambda: RgbdFrame(GREY, METRES, color=COLOR.astype(np.uint16)), "color: of uint16; pass RGB"),
+    (lambda: RgbdFrame.from_color(COLOR.astype(np.uint16), METRES), "color: of uint16; pass RGB"),
+    (lambda: RgbdFrame.from_color(COLOR / 255, METRES), "color: .* got float64; pass RGB"),
+    (lambda: RgbdFrame.from_color(COLOR.tolist(), METRES), "color: expected a numpy array"),
+    (lambda: RgbdFrame.from_color(COLOR[..., 0], METRES), "color: .* pass RGB"),
+    (lambda: Camera("16", 12, 10, 10, 8, 6), "width is '16'; expected a positive whole number"),
+    (lambda: Camera(16, 12.0, 10, 10, 8, 6), "height is 12.0; expected"),
+    (lambda: Camera(0, 12, 10, 10, 8, 6), "width is 0; expected"),
+    (lambda: Camera(16, 12, None, 10, 8, 6), "fx is None; expected a finite number"),
+    (lambda: Camera(16, 12, 10, 10, np.nan, 6), "cx is nan; expected a finite number"),
+    (lambda: Camera(16, 12, 10, -1, 8, 6), "positive focal lengths"),
+    (lambda: Camera.from_field_of_view(16, 12, 0), "0 degrees wide; expected more than 0"),
+    (lambda: RgbdPair(GREY, METRES, WIDE), r"source: of type ndarray; expected RgbdFrame.from_color"),
+    (lambda: RgbdPair(a_frame(), a_frame(), None), "camera: of type NoneType; expected Camera"),
+    (lambda: RgbdPair(a_frame(), a_frame(), WIDE.scaled(8, 6)), "expected 8x6 pixels as the camera has"),
+    (lambda: estimate_flow((a_frame(), a_frame())), "pair: of type tuple; expected RgbdPair"),
+    (lambda: RgbdEstimator("camera.toml"), "camera: of type str; expected Camera"),
+    (lambda: Open3dOdometry("camera.toml"), "camera: of type str; expected Camera"),
+    (lambda: RgbdEstimator(WIDE).step((GREY, METRES)), "frame: of type tuple; expected RgbdFrame")])
+def test_what_is_no_frame_or_camera_is_refused(made, said):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(LidarflowError, match=said) as caught:
+            made()
+    assert isinstance(caught.value, ValueError)
+
+
+def test_masked_depth_is_no_reading():
+    depth = np.ma.masked_array(METRES, mask=False)
+    depth[3] = np.ma.masked
+    frame = RgbdFrame(GREY, depth)
+    assert type(frame.depth) is np.ndarray
+    np.testing.assert_array_equal(frame.depth, METRES * (np.arange(12) != 3)[:, None])
+
+
+def test_numbers_of_numpy_make_a_camera_that_files_can_hold():
+    camera = Camera(np.int64(16), np.int32(12), np.float32(10), 10, np.float64(8), 6)
+    assert camera == Camera(16, 12, 10.0, 10.0, 8.0, 6.0)
+    assert json.loads(json.dumps(asdict(camera)))["width"] == 16

@@ -7,7 +7,7 @@ from lidarflow.kernels import cluster_images
 from lidarflow.rgbd import clusters as geometric
 from lidarflow.rgbd import odometry, propagation, pyramid, refinement, segmentation
 from lidarflow.rgbd_config import RgbdConfig
-from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult
+from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult, check_is
 from lidarflow.stopwatch import Stopwatch
 
 
@@ -18,6 +18,7 @@ def estimate_flow(
 
     `previous` is the result of the pair that ended with this pair's source, if there is one.
     """
+    check_is("pair", pair, RgbdPair)
     config = given(config, RgbdConfig)
     timed = Stopwatch()
     with timed("pyramid"):
@@ -32,6 +33,7 @@ class RgbdEstimator:
     tracks: None = None     # no object has a number
 
     def __init__(self, camera: Camera, config: RgbdConfig | None = None):
+        check_is("camera", camera, Camera)
         self.camera = camera
         self.config = given(config, RgbdConfig)
         self.reset()

@@ -8,7 +8,7 @@ import numpy as np
 from lidarflow.errors import DataError
 from lidarflow.kernels import images
 from lidarflow.rgbd_config import ImagesConfig
-from lidarflow.rgbd_types import Camera, RgbdFrame
+from lidarflow.rgbd_types import Camera, RgbdFrame, check_is
 
 _SMALLEST_SIDE = 8   # pixels; a coarser level would have no gradients to speak of
 
@@ -60,6 +60,7 @@ def _resized(
     frame: RgbdFrame, camera: Camera, config: ImagesConfig
 ) -> tuple[np.ndarray, np.ndarray, Camera]:
     """Intensity and depth (H, W) float32 at the working size, and the camera of that size."""
+    check_is("frame", frame, RgbdFrame)
     if frame.shape != (camera.height, camera.width):
         height, width = frame.shape
         raise DataError(f"{frame.name}: {width}x{height} pixels, but the camera has "
