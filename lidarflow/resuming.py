@@ -1,5 +1,7 @@
 """Whether a run folder holds the beginning of the run that is asked for, or all of it."""
 
+import json
+import zipfile
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -64,6 +66,20 @@ def state_of(out: Path, plan: Plan) -> State:
         raise DataError(f"--resume: {out} was made {differs}; ask for the same, or run without --resume to "
                         "begin anew")
     return State.BEGUN if begun else State.COMPLETE
+
+
+def damaged_files(out: Path) -> list[str]:
+    """Names in a complete run's folder of what other commands need and is missing, or of a flow file cut off.
+
+    Flow files are not read: one whose table of contents is there counts as whole.
+    """
+    try:
+        frames = list(json.loads((out / io.TIMING_FILE).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return [io.TIMING_FILE]
+    flows = [f"{io.FLOW_FOLDER}/{frame}.npz" for frame in frames]
+    damaged = [name for name in flows if not zipfile.is_zipfile(out / name)]
+    return damaged if (out / "poses_tum.txt").is_file() else [*damaged, "poses_tum.txt"]
 
 
 def _difference(out: Path, plan: Plan) -> str:

@@ -148,16 +148,19 @@ def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Pat
              jump: int = 0, n_frames: int | None = None, going: "Going | None" = None) -> None:
     """Run over a folder and say what was found."""
     from lidarflow import rgbd_runner, runner
+    from lidarflow.resuming import damaged_files
     from lidarflow.rgbd_tables import run_notes, run_table
-    from lidarflow.tables import skipped_lines, where_results_are
+    from lidarflow.tables import complete_line, skipped_lines, where_results_are
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(folder, jump, n_frames, "frames")
     skipped: list[Skipped] = []
     going = replace(going or runner.Going(), on_skip=skipped.append)
     if going.resume and runner.is_complete(folder, frames, settings, out, method, going):
-        print(f"complete   {out}: nothing is left to do")
-        return
+        damaged = damaged_files(out)
+        print(complete_line(out, damaged))
+        if not damaged:
+            return
     announce_first_use()
     with progress("frame pairs", len(frames) - 1) as bar:
 

@@ -1,6 +1,7 @@
 """A whole run over RGB-D frames: a folder of images in, a folder of results out."""
 
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -83,7 +84,8 @@ def _write_pair(folder: RgbdFolder, step: Step, plan: Plan, out: Path, stream, w
     begin, pair, result = time.perf_counter(), step.pair, step.result
     report = report_pair(pair, result, folder.truth(step.index), folder.world_from_camera(), step.index)
     file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
-    if not (step.restored and file.is_file()):     # a checkpoint is younger than its flow file
+    # A checkpoint is younger than its flow file, which may have been cut off since.
+    if not (step.restored and zipfile.is_zipfile(file)):
         rgbd_io.save_flow(file, pair.source, result, plan.config, stats_of(plan.method, report))
     world_from_source = way.reached(step.index)
     if stream is not None:

@@ -51,15 +51,18 @@ def process(
 ) -> None:
     """Run over a data set and say what was found."""
     from lidarflow import runner
-    from lidarflow.tables import run_notes, run_table, skipped_lines, where_results_are
+    from lidarflow.resuming import damaged_files
+    from lidarflow.tables import complete_line, run_notes, run_table, skipped_lines, where_results_are
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(dataset, jump, n_scans)
     skipped: list[Skipped] = []
     going = replace(going or runner.Going(), on_skip=skipped.append, chunk=spread.chunk if spread else 0)
     if going.resume and runner.is_complete(dataset, frames, settings, out, method, going):
-        print(f"complete   {out}: nothing is left to do")
-        return
+        damaged = damaged_files(out)
+        print(complete_line(out, damaged))
+        if not damaged:
+            return
     if spread is not None:
         _compute(dataset, frames, settings, out, method, going, spread)
         going = replace(going, resume=True)

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import time
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
@@ -201,7 +202,8 @@ def _write_pair(
     begin, pair, result = time.perf_counter(), step.pair, step.result
     file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
     with Aside() as beside:
-        if not (step.restored and file.is_file()):     # a checkpoint is younger than its flow file
+        # A checkpoint is younger than its flow file, which may have been cut off since.
+        if not (step.restored and zipfile.is_zipfile(file)):
             saved = beside.begin(io.save_flow, file, pair.source.points, result, config)
         else:
             saved = there(None)

@@ -161,6 +161,14 @@ def skipped_lines(skipped: list[Skipped], count: int, pairs: int, what: str = "s
             f"skipped    {len(skipped)} of {count} {what}s; {pairs} pairs are left\n"]
 
 
+def complete_line(out: Path, damaged: list[str]) -> str:
+    """What is said of a run that was complete, and of its files that are `damaged` by now."""
+    if not damaged:
+        return f"complete   {out}: nothing is left to do"
+    others = f" and {len(damaged) - 1} more files are" if damaged[1:] else " is"
+    return f"damaged    {out}: {damaged[0]}{others} missing or cut off; all pairs are computed anew"
+
+
 def where_results_are(out: Path, is_recorded: bool) -> list[str]:
     """What a run over a sequence says at its end, a line each."""
     told = [f"results    {out}", f"metrics    {out / 'metrics.json'}",

@@ -176,6 +176,33 @@ def test_a_complete_run_has_nothing_left_to_do(street, tmp_path, lidarflow):
     assert {file: file.stat().st_mtime_ns for file in out.rglob("*")} != before
 
 
+def truncate(file):
+    file.write_bytes(file.read_bytes()[:-30])
+
+
+@pytest.mark.parametrize("name, harm", [
+    ("flow/000001.npz", Path.unlink), ("flow/000001.npz", truncate), ("poses_tum.txt", Path.unlink),
+    ("timing.json", truncate)])
+def test_a_complete_run_that_lost_something_is_made_whole(street, tmp_path, lidarflow, name, harm):
+    out = tmp_path / "run"
+    words = ("run", street, "--out", out, "--resume", "-n", 4, "--method", "icp", "--no-record")
+    lidarflow.ok(*words)
+    whole = contents(out)
+    harm(out / name)
+    assert f"damaged    {out}: {name} is missing or cut off" in lidarflow.ok(*words)
+    assert contents(out) == whole and "nothing is left to do" in lidarflow.ok(*words)
+
+
+def test_flow_files_that_an_interrupted_run_lost_are_written_again(street, unbroken, tmp_path):
+    out = tmp_path / "run"
+    words = ("run", street, "--out", out, "--no-record", "--resume")
+    assert was_killed(program(words, "lidarflow.io.write_objects", 1))
+    (out / "flow" / "000000.npz").unlink()
+    truncate(out / "flow" / "000001.npz")
+    assert program(words).returncode == 0
+    assert contents(out) == unbroken
+
+
 # Checkpoints.
 
 def test_a_checkpoint_comes_back_to_the_last_bit(street, tmp_path):

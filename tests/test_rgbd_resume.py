@@ -155,6 +155,16 @@ def test_a_complete_run_has_nothing_left_to_do(room, tmp_path, lidarflow):
     assert {file: file.stat().st_mtime_ns for file in out.rglob("*")} == before
 
 
+def test_a_complete_run_that_lost_a_flow_file_is_made_whole(room, tmp_path, lidarflow):
+    out = tmp_path / "run"
+    words = ("rgbd", "run", room, "--out", out, "-n", 2, "--no-record", "--resume")
+    lidarflow.ok(*words)
+    whole, file = contents(out), next((out / "flow").iterdir())
+    file.write_bytes(file.read_bytes()[:-30])
+    assert f"damaged    {out}: flow/{file.name} is missing or cut off" in lidarflow.ok(*words)
+    assert contents(out) == whole and "nothing is left to do" in lidarflow.ok(*words)
+
+
 def test_other_commands_say_that_it_is_a_run_of_images(room, tmp_path, lidarflow):
     out = tmp_path / "run"
     lidarflow.ok("rgbd", "run", room, "--out", out, "-n", 2, "--no-record")
