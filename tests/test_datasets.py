@@ -1,6 +1,7 @@
 """Opening data sets: what lies in a folder is recognised, what is wrong with it is one clear line."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from shared_data import SHARED, needs_shared
 
 from lidarflow import pose
 from lidarflow.datasets import LOADERS, guess_loader, loader_names, open_dataset
+from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.datasets.kitti_correction import correct_vertical_angle
 from lidarflow.errors import ConfigError, DataError, InstallError
 
@@ -24,6 +26,24 @@ def test_a_folder_is_read_in_natural_order(tmp_path):
     assert (data.loader, data.note, data.truth(0), data.world_from_sensor()) == ("folder", "", None, None)
     assert "no scan 3; there are 3" in message(data.scan, 3)
     assert "no scan -1" in message(data.scan, -1)
+
+
+def test_the_order_of_equal_numbers_and_of_digits_that_are_no_numbers_is_fixed():
+    names = ["01.bin", "1.bin", "1²2.bin", "1²10.bin", "٢.bin"]
+    for order in (names, names[::-1]):
+        assert [file.name for file in natural_sorted(map(Path, order))] == names
+
+
+@pytest.mark.parametrize("pair", [("1.bin", "1.BIN"), ("Scan1.bin", "scan1.bin")])
+def test_scans_whose_results_would_share_a_file_are_refused(tmp_path, pair):
+    for name in (*pair, "01.bin"):
+        write_bin(tmp_path / name)
+    if len(list(tmp_path.iterdir())) < 3:
+        pytest.skip("this disc takes small letters for capitals")
+    said = message(open_dataset, tmp_path)
+    assert all(name in said for name in pair) and "rename one of them" in said
+    (tmp_path / pair[1]).unlink()
+    assert len(open_dataset(tmp_path)) == 2
 
 
 def test_times_come_from_names_or_from_a_file(tmp_path):

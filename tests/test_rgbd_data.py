@@ -317,6 +317,15 @@ def test_numbered_images_in_one_folder(tmp_path):
         open_rgbd(tmp_path)
 
 
+def test_images_whose_results_would_share_a_file_are_refused(images, tmp_path):
+    for image in images:
+        for name in ("1.png", "1.jpg"):
+            (tmp_path / image.stem).mkdir(exist_ok=True)
+            (tmp_path / image.stem / name).write_bytes(image.read_bytes())
+    with pytest.raises(DataError, match=r"1\.jpg and 1\.png: .* rename one of them"):
+        open_rgbd(tmp_path)
+
+
 def test_an_image_of_another_size_in_the_middle(tmp_path):
     write_images(tmp_path, "color{}.png", "depth{}.png")
     for kind in ("color", "depth"):

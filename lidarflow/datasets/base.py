@@ -57,7 +57,7 @@ class Dataset(Protocol):
 class ScanFiles:
     """Scans in one file each; loaders add the truth and the poses that they know of.
 
-    files     in order of time
+    files     in order of time, no two of one name but for suffix and capitals
     times_ns  one per file; None = read from the file names, else 10 Hz
     correct   whether the KITTI vertical-angle correction is applied
     """
@@ -69,6 +69,7 @@ class ScanFiles:
                  correct: bool = False, notes: Sequence[str] = ()):
         self.name = name
         self.files = list(files)
+        clouds.check_names(self.files)
         self.times_ns = list(times_ns) if times_ns is not None else times_from_names(self.files)
         self.correct = correct
         assumed = ["KITTI vertical-angle correction on"] if correct else []

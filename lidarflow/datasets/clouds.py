@@ -89,12 +89,22 @@ def visible_files(folder: Path) -> list[Path]:
 
 
 def natural_sorted(files) -> list[Path]:
-    """Files by name, numbers in names by value: scan2 comes before scan10."""
-    def key(file: Path) -> list:
+    """Files by name, numbers in names by value: scan2 comes before scan10, of equal ones 01 before 1."""
+    def key(file: Path) -> tuple[list, str]:
         parts = re.split(r"(\d+)", file.name)
-        return [int(part) if part.isdigit() else part for part in parts]
+        return [int(part) if part.isdecimal() else part for part in parts], file.name
 
     return sorted(files, key=key)
+
+
+def check_names(files: Sequence[Path]) -> None:
+    """Raise DataError where two files would share one file of results; some discs take a for A."""
+    seen: dict[str, Path] = {}
+    for file in files:
+        other = seen.setdefault(file.stem.casefold(), file)
+        if other is not file:
+            raise DataError(f"{other} and {file.name}: are the same but for suffix and capitals, and results "
+                            "are named by what remains; rename one of them")
 
 
 def load_arrays(path: Path, keys: Sequence[str] = ()) -> dict[str, np.ndarray]:

@@ -74,6 +74,7 @@ class RgbdFolder:
     """
 
     def __init__(self, folder: Path, listing: _Listing, camera: Camera, origin: str):
+        clouds.check_names(listing.color)
         self.name = f"{listing.layout} {folder_name(folder)}"
         self.layout, self.camera = listing.layout, camera
         self.source = RgbdSource(folder.resolve(), camera, float(listing.depth_scale))
