@@ -181,6 +181,8 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator:
                            ) from None
     if scheduler is not None:
         try:
+            # A client that is not made with an address may not be ended without a traceback.
+            distributed.comm.resolve_address(scheduler)
             client = distributed.Client(scheduler, timeout="10s", set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             raise DataError(f"--scheduler {scheduler}: no Dask scheduler answers ({type(error).__name__}); "

@@ -84,12 +84,13 @@ def process(
 def _compute(dataset: "Dataset", frames: list[int], settings: "Config", out: Path, method: str,
              going: "Going", spread: Spread) -> None:
     """Have the pairs computed by workers; the run is put together of what they find."""
-    from lidarflow import cluster, runner
+    from lidarflow import cluster, io, runner
 
     chunks = cluster.chunks_of(frames, spread.chunk, settings)
-    kept = runner.begin(dataset, frames, settings, out, method, going)
+    io.check_run_folder(out)
     with cluster.connected(spread.workers, spread.scheduler) as client, progress(
             "scan pairs computed", len(frames) - 1) as bar:
+        kept = runner.begin(dataset, frames, settings, out, method, going)
         there = len(client.scheduler_info(n_workers=-1)["workers"])
         print(f"workers    {there}, {len(chunks)} chunks of up to {spread.chunk} pairs")
         cluster.compute(dataset, chunks, settings, method, kept, client, going.skip_bad,

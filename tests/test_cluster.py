@@ -139,12 +139,22 @@ def test_what_is_missing_is_said_in_one_line(street, tmp_path, lidarflow, monkey
     assert "only with --workers" in lidarflow.complaint(*run, "--chunk", 2)
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert "lidarflow[dask]" in lidarflow.complaint(*run, "--workers", 2)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow
 def test_no_scheduler_is_one_line(street, tmp_path):
     done = program(("run", street, "--out", tmp_path / "run", "--scheduler", "tcp://127.0.0.1:1"))
     assert done.returncode == 1 and "no Dask scheduler answers" in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("address", ["foo", "foo:1", "xyz://127.0.0.1:1", "tcp://127.0.0.1"])
+def test_what_is_no_address_is_one_line(street, tmp_path, address):
+    out = tmp_path / "run"
+    done = program(("run", street, "--out", out, "--scheduler", address))
+    assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+    assert f"--scheduler {address}: no Dask scheduler answers" in done.stderr
+    assert not out.exists()
 
 
 def test_workers_here_are_reached_from_here_only():
