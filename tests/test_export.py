@@ -252,9 +252,16 @@ def complaint_of_file(lidarflow, folder):
 
 
 def test_damaged_flow_files_and_poses(lidarflow, run, tmp_path):
+    lidarflow.ok("export", "run", "--format", "ply", "--out", "earlier")
+    before = (tmp_path / "earlier" / "000000.ply").read_bytes()
+    make_unknown(run / "flow" / "000000.npz")
     (run / "flow" / "000001.npz").write_bytes(b"PK")
-    assert "not an .npz archive" in lidarflow.complaint("export", "run", "--format", "opensceneflow")
-    assert not list(tmp_path.glob("run-opensceneflow/*")), "half a scene is not kept"
+    for name in ("opensceneflow", "ply", "av2-v2"):
+        assert "not an .npz archive" in lidarflow.complaint("export", "run", "--format", name)
+        assert not [file for file in tmp_path.glob(f"run-{name}/**/*") if file.is_file()], "no half is kept"
+    assert "not an .npz archive" in lidarflow.complaint(
+        "export", "run", "--format", "ply", "--out", "earlier")
+    assert (tmp_path / "earlier" / "000000.ply").read_bytes() == before and not rests(tmp_path)
     (run / "poses_tum.txt").write_text("-1 0 0 0 0 0 0 1\n")
     assert "expected seconds, not negative" in lidarflow.complaint("export", "run", "--format", "tum")
     (run / "poses_tum.txt").write_text("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n")

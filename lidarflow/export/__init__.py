@@ -31,7 +31,7 @@ MASKED_FORMATS = ("av2-v1",)                       # what may be limited to the 
 def export(
     run_dir: Path, name: str, out: Path | None = None, data: Path | None = None, masks: Path | None = None,
 ) -> Iterator[Path]:
-    """Write a run in the format called `name`; yields every file once it is complete.
+    """Write a run in the format called `name`; yields every file once all of its kind are complete.
 
     out    a folder, or a .txt file for poses; beside the run if not given
     data   where the run's data set is now, if not where it was

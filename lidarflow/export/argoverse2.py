@@ -8,6 +8,7 @@ Flow is float16, in the axes of the target's frame. What is not known of a NaN p
 v1 wants the sweeps and points of the official masks alone; the others want every point.
 """
 
+import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -52,18 +53,20 @@ def _write(
         raise InstallError(f"{out}: .feather needs the package pyarrow; pip install pyarrow") from None
     log = scene_name(run.dataset())
     counted = None if masks is None else _counted(run, Masks.find(masks, log))
-    for number, _, found in run.pairs():
-        time_ns = int(run.times_ns[number])
-        columns = columns_of(found)
-        if counted is not None:
-            if time_ns not in counted.times_ns:
-                continue
-            mask = counted.of(time_ns, len(found.points))
-            columns = {name: values[mask] for name, values in columns.items()}
-        file = out / log / f"{time_ns}.feather"
-        with written_aside(file) as aside:
+    files = []
+    with contextlib.ExitStack() as written:     # all files or none
+        for number, _, found in run.pairs():
+            time_ns = int(run.times_ns[number])
+            columns = columns_of(found)
+            if counted is not None:
+                if time_ns not in counted.times_ns:
+                    continue
+                mask = counted.of(time_ns, len(found.points))
+                columns = {name: values[mask] for name, values in columns.items()}
+            files.append(out / log / f"{time_ns}.feather")
+            aside = written.enter_context(written_aside(files[-1]))
             feather.write_feather(pyarrow.table(columns), str(aside))
-        yield file
+    yield from files
 
 
 def _counted(run: FinishedRun, masks: Masks) -> Masks:

@@ -5,6 +5,7 @@ saturation the speed), flow_x, flow_y, flow_z (metres, total) and object (-1 = n
 points that are not finite are left out.
 """
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,13 +22,15 @@ _PLY_TYPES = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
 
 
 def write(run: FinishedRun, out: Path) -> Iterator[Path]:
-    """One file per pair, named as its source scan."""
-    for number, name, found in run.pairs():
-        file = out / f"{name}.ply"
-        vertices = vertices_of(found, run.dt_s(number))
-        with written_aside(file) as aside:
+    """One file per pair, named as its source scan; all of them or none."""
+    files = []
+    with contextlib.ExitStack() as written:
+        for number, name, found in run.pairs():
+            files.append(out / f"{name}.ply")
+            vertices = vertices_of(found, run.dt_s(number))
+            aside = written.enter_context(written_aside(files[-1]))
             aside.write_bytes(_header(len(vertices)) + vertices.tobytes())
-        yield file
+    yield from files
 
 
 def vertices_of(found: FlowFile, dt_s: float) -> np.ndarray:
