@@ -76,7 +76,7 @@ def test_images_that_are_no_frame(images, tmp_path):
                         ((color, tmp_path / "shallow.png"), "8-bit image"),
                         ((color, tmp_path / "wide.png"), "9x6 pixels, but .* has 8x6"),
                         ((color, tmp_path / "float.tiff"), "mode F"),
-                        ((color, tmp_path / "text.png"), "not a readable image"),
+                        ((color, tmp_path / "text.png"), r"readable image \(cannot identify image file\)"),
                         ((color, tmp_path / "none.png"), "no such file"), ((tmp_path, depth), "is a folder")):
         with pytest.raises(DataError, match=found):
             rgbd_images.read_frame(*pair)

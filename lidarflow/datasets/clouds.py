@@ -128,8 +128,9 @@ def load_array(path: Path) -> np.ndarray:
 
 
 def one_line(error: BaseException) -> str:
-    """The first line of an error's text, or its kind where it has none."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    """The first line of an error's text, or its kind where it has none, without addresses in memory."""
+    text = re.sub(r" ?<[^<>]* at 0x[0-9a-fA-F]+>", "", str(error))
+    return (text.strip().splitlines() or [type(error).__name__])[0]
 
 
 def _check_is_file(path: Path) -> None:
