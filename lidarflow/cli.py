@@ -18,6 +18,7 @@ from lidarflow.rgbd_cli import app as rgbd_app
 from lidarflow.run_cli import Spread, pairs_done, process
 from lidarflow.terminal import Resume
 from lidarflow.terminal import announce_first_use as _announce_first_use
+from lidarflow.terminal import check_exists as _check_exists
 from lidarflow.terminal import check_live_view as _check_live_view
 from lidarflow.terminal import show as _print
 from lidarflow.terminal import working as _working
@@ -228,6 +229,7 @@ def evaluate(
     from lidarflow import evaluation, io, score_tables
     from lidarflow.tables import run_table
 
+    _check_exists(what, "a run folder or a flow file (.npz)")
     if out is not None:
         io.check_output("--out", out, ".json", inputs=(what,))
     with _working(f"scores of {what}"):
@@ -277,10 +279,12 @@ def view(
 
     from lidarflow import io, rgbd_io, viewer
 
+    _check_exists(what, "a run folder, a recording (.rrd) or a flow file (.npz)")
     if save is not None:
         io.check_output("--save", save, ".rrd", inputs=(what,))
     if what.is_dir() or what.suffix == ".rrd":
         recording = io.find_recording(what)
+        viewer.check_recording(recording)
         if save is None:
             viewer.open_in_viewer(recording)
         else:

@@ -1,9 +1,12 @@
 """What all commands of the command line share: the console, a spinner, and the check for a viewer."""
 
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from lidarflow.errors import DataError
 
 Resume = Annotated[bool, typer.Option(
     "--resume", help="Go on with a run that was interrupted; the results are the same.")]
@@ -39,6 +42,12 @@ def progress(what: str, total: int):
     bar = Progress(*columns, console=on, disable=not on.is_terminal)
     bar.add_task(what, total=total)
     return bar
+
+
+def check_exists(what: Path, expected: str) -> None:
+    """DataError, which says what is `expected`, where there is nothing at `what`."""
+    if not what.exists():
+        raise DataError(f"{what}: no such file or folder; expected {expected}")
 
 
 def announce_first_use() -> None:

@@ -43,6 +43,7 @@ _ARROW_ABOVE_M = 0.4
 _WHEEL_PX = 420
 _SENSOR_OUTLINE = np.array([(1.2, 0, 0), (-0.8, 0.8, 0), (-0.4, 0, 0), (-0.8, -0.8, 0), (1.2, 0, 0)])
 _EARLIEST_DATE_NS = 10**17  # 1973: smaller times count from the start of the drive
+_FIRST = b"RRF"              # what a recording begins with, before the number of its format
 _FOOTER = b"RRF2FOOT"        # what a recording ends with
 _FOOTER_BYTES = 64
 _PORT = 9876
@@ -181,6 +182,15 @@ def blueprint(with_alignment: bool = True, with_crispness: bool = True) -> rrb.B
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=FRAME, fps=10.0))
+
+
+def check_recording(path: Path) -> None:
+    """Raise DataError unless a file begins as recordings do."""
+    with Path(path).open("rb") as file:
+        first = file.read(len(_FIRST) + 1)
+    if not first.startswith(_FIRST):
+        raise DataError(f"{path}: not a recording, it begins with {first!r}; expected an .rrd file of rerun, "
+                        "such as 'lidarflow run' and 'lidarflow view --save' write")
 
 
 def open_in_viewer(rrd_path: Path) -> None:

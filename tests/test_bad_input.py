@@ -246,11 +246,16 @@ def test_view_of_what_is_no_result(lidarflow, folder, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04 cut")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    for what, found in (("absent.npz", "no such file"), ("absent.rrd", "no such recording"),
-                        ("absent", "no such file"), ("empty", "no recording.rrd"),
+    (tmp_path / "page.rrd").write_text("<!DOCTYPE html>")
+    (tmp_path / "none.rrd").touch()
+    kinds = "no such file or folder; expected a run folder, a recording (.rrd) or a flow file (.npz)"
+    for what, found in (("absent.npz", kinds), ("absent.rrd", kinds), ("absent", kinds),
+                        ("page.rrd", "page.rrd: not a recording, it begins with b'<!DO'; expected"),
+                        ("none.rrd", "not a recording"), ("empty", "no recording.rrd"),
                         ("broken.npz", "truncated"), ("other.npz", "not a flow file"),
                         (folder / "000000.bin", "expected a flow file")):
         for more in ((), ("--save", "new.rrd")):
             assert found in lidarflow.complaint("view", what, *more)
     assert "ending in .rrd" in lidarflow.complaint("view", "other.npz", "--save", "new.png")
+    assert "expected a run folder or a flow file (.npz)" in lidarflow.complaint("eval", "absent")
     assert not list(tmp_path.glob("new.*")) and not rests(tmp_path)
