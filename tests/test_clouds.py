@@ -76,6 +76,7 @@ def test_what_is_not_a_cloud_file(tmp_path):
     (np.zeros(9), "(9,) of float64"),
     (np.zeros((5, 3), complex), "complex128"),
     (np.array([["a", "b", "c"]]), "<U1"),
+    (np.zeros((3, 500)), "(3, 500); expected a row (N, 3) for each point, this looks transposed"),
     (np.array([{}, []], dtype=object), "not a readable .npy array"),
 ])
 def test_wrong_npy(tmp_path, array, found):

@@ -20,6 +20,7 @@ from lidarflow.errors import DataError
 from lidarflow.types import Scan
 
 KITTI_POINT_BYTES = 16
+_MOST_FIELDS = 32     # more than a sensor tells of a point
 
 
 def read_points(path: Path) -> np.ndarray:
@@ -190,6 +191,9 @@ def _is_cloud(array: np.ndarray) -> bool:
 def _columns(path: Path, array: np.ndarray) -> np.ndarray:
     if not _is_cloud(array):
         raise DataError(f"{path}: an array {array.shape} of {array.dtype}; expected numbers (N, 3) or wider")
+    if len(array) <= _MOST_FIELDS < array.shape[1]:
+        raise DataError(f"{path}: an array {array.shape}; expected a row (N, 3) for each point, this looks "
+                        "transposed, a column for each")
     return array[:, :3]
 
 
