@@ -104,6 +104,10 @@ def test_scans_that_cannot_be_used(lidarflow, folder, tmp_path, name, found):
         assert found in lidarflow.complaint("pair", *pair, "--out", "new/flow.npz", "--picture", "p.png",
                                             "--recording", "r.rrd")
         assert sorted(tmp_path.rglob("*")) == before, "a failed pair leaves nothing"
+    if "registration" in found:
+        for method in ("ours", "ego"):
+            assert f"{name}: registration: " in lidarflow.complaint(
+                "pair", folder / "000001.bin", file, "--out", "flow.npz", "--method", method)
 
 
 def test_clouds_that_are_no_files(lidarflow, folder):

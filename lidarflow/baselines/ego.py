@@ -44,7 +44,7 @@ class Ego(WholeScan):
     def _prepare(self, scan: Scan) -> _Prepared:
         seen = super()._prepare(scan)
         with self._timed("ego-motion"):
-            return _Prepared(seen.usable, seen.ground, ego.Thinned.of(scan.points, self.config))
+            return _Prepared(seen.usable, seen.ground, ego.Thinned.of_scan(scan, self.config))
 
     def _register(self, pair, source, target) -> Registered:
         with self._timed("ego-motion"):

@@ -43,6 +43,14 @@ class Thinned:
         """Of the points (N, 3) in range, thinned to the wanted voxel, to a smaller one in a small place."""
         return cls(*Planes.in_range(points, config.preparation, config.ego.voxel_m))
 
+    @classmethod
+    def of_scan(cls, scan: Scan, config: Config) -> "Thinned":
+        """As `of`; DataError, which names the scan, where too few points are left."""
+        try:
+            return cls.of(scan.points, config)
+        except DataError as error:
+            raise DataError(f"{scan.name}: {error}") from None
+
 
 def find(source: Thinned, target: Thinned, guess: np.ndarray | None, config: EgoConfig) -> np.ndarray:
     """target_from_source (4, 4), as the settings want it.

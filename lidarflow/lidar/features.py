@@ -75,7 +75,7 @@ def extract(scan: Scan, config: Config, beside: Aside | None = None) -> Features
     All but the masks is done `beside` the caller where there is such a thing.
     """
     begin = beside.begin if beside else done
-    thinned = begin(ego.Thinned.of, scan.points, config)
+    thinned = begin(ego.Thinned.of_scan, scan, config)
     seen = masks(scan, config)
     cloud = begin(_cloud, scan.points, seen, config)
     return Features(seen.usable, seen.ground, thinned, cloud, begin(_keypoints, seen, cloud, config))
