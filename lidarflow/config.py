@@ -22,9 +22,10 @@ _TOO_LARGE = 2**63
 
 
 def setting(default: Any, effect: str, *, low: float | None = None, high: float | None = None,
-            choices: tuple[str, ...] | None = None) -> Any:
-    """A dataclass field with its effect in words and the values it may take."""
-    return field(default=default, metadata={"effect": effect, "low": low, "high": high, "choices": choices})
+            choices: tuple[str, ...] | None = None, below: str | None = None) -> Any:
+    """A dataclass field with its effect in words and the values it may take, `below` another's here."""
+    return field(default=default, metadata={"effect": effect, "low": low, "high": high, "choices": choices,
+                                            "below": below})
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,8 @@ class PreparationConfig:
     kitti_correction: str = setting(
         "auto", "raise KITTI points by the 0.205 deg that their calibration lacks; auto = for KITTI data",
         choices=("auto", "on", "off"))
-    min_range_m: float = setting(1.5, "nearer returns are the ego vehicle and are masked", low=0)
+    min_range_m: float = setting(1.5, "nearer returns are the ego vehicle and are masked", low=0,
+                                 below="max_range_m")
     max_range_m: float = setting(80.0, "farther returns are masked", low=1)
 
 
@@ -218,7 +220,8 @@ def load(file: Path | str | None, overrides: tuple[str, ...], kind: type[Setting
 def load(file: Path | str | None = None, overrides: tuple[str, ...] = (), kind: Any = Config) -> Any:
     """Defaults of a `kind` of settings, then a TOML file, then overrides such as "mesh.max_edge_m=0.5".
 
-    Raises ConfigError for a file that cannot be read, an unknown key, or a value out of range.
+    Raises ConfigError for a file that cannot be read, an unknown key, a value out of range, or values that
+    contradict each other.
     """
     if isinstance(overrides, str):
         raise ConfigError(f"overrides: the text {overrides!r}; expected several, as in ({overrides!r},)")
@@ -227,6 +230,7 @@ def load(file: Path | str | None = None, overrides: tuple[str, ...] = (), kind: 
         config = updated(config, read_toml(Path(file)), str(file))
     for override in overrides:
         config = updated(config, _parse_override(override), "--set")
+    _check_together(config)
     return config
 
 
@@ -325,6 +329,17 @@ def _check(section_config: Any, section: str, name: str, value: Any, origin: str
         if value != value or (low is not None and value < low) or (high is not None and value > high):
             raise ConfigError(f"{key}: expected {_range_text(meta)}, got {value!r}")
     return value
+
+
+def _check_together(config: Any) -> None:
+    """ConfigError where settings that are right one by one contradict each other."""
+    for section in fields(config):
+        values = getattr(config, section.name)
+        for f in fields(values):
+            value, name = getattr(values, f.name), f.metadata["below"]
+            if name is not None and value >= getattr(values, name):
+                raise ConfigError(f"settings: {section.name}.{f.name}: expected less than {name}, which is "
+                                  f"{getattr(values, name)!r}, got {value!r}")
 
 
 def _nearest(name: str, known) -> str:

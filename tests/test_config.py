@@ -87,6 +87,17 @@ def test_a_mistake_in_a_file_names_the_file(tmp_path, text, message):
     assert str(file) in str(caught.value)
 
 
+def test_limits_that_leave_no_range_are_refused_wherever_they_come_from(tmp_path):
+    file = toml(tmp_path, "[preparation]\nmin_range_m = 100.0\n")
+    message = r"preparation\.min_range_m: expected less than max_range_m, which is 80\.0, got 100\.0"
+    for given in ((file, ()), (None, ("preparation.min_range_m=100",))):
+        with pytest.raises(ConfigError, match=message):
+            load(*given)
+    with pytest.raises(ConfigError, match=r"which is 5\.0, got 5\.0"):
+        load(None, ("preparation.max_range_m=5", "preparation.min_range_m=5"))
+    assert load(file, ("preparation.max_range_m=200",)).preparation.min_range_m == 100.0
+
+
 def test_files_that_cannot_be_read_are_errors_too(tmp_path):
     with pytest.raises(ConfigError, match="no such settings file"):
         load(tmp_path / "absent.toml")
