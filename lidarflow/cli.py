@@ -7,7 +7,7 @@ import contextlib
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -15,17 +15,14 @@ from lidarflow import __version__
 from lidarflow.errors import LidarflowError
 from lidarflow.export_cli import export
 from lidarflow.rgbd_cli import app as rgbd_app
-from lidarflow.run_cli import Spread, pairs_done, process
+from lidarflow.run_cli import Spread, open_data, pairs_done, process
 from lidarflow.terminal import Resume
 from lidarflow.terminal import announce_first_use as _announce_first_use
 from lidarflow.terminal import check_exists as _check_exists
 from lidarflow.terminal import check_live_view as _check_live_view
+from lidarflow.terminal import check_words as _check_words
 from lidarflow.terminal import show as _print
 from lidarflow.terminal import working as _working
-
-if TYPE_CHECKING:
-    from lidarflow.config import Config
-    from lidarflow.datasets import Dataset
 
 _INTERRUPTED = 130     # what typer makes of Ctrl-C
 
@@ -59,6 +56,7 @@ def main() -> None:
     # A terminal that lacks a letter shows another one; that is no reason to lose the results.
     sys.stdout.reconfigure(errors="replace")
     try:
+        _check_words(sys.argv[1:])
         app(prog_name="lidarflow")
     except LidarflowError as error:
         print(f"lidarflow: {' '.join(str(error).split())}", file=sys.stderr)
@@ -174,7 +172,7 @@ def run(
 
     settings = load(config, _with_solver(overrides, solver))
     methods.find(method)
-    dataset = _open(data, dataloader, sequence, settings)
+    dataset = open_data(data, dataloader, sequence, settings)
     print(f"method     {method}")
     process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans, method,
              Going(resume, skip_bad), Spread.wanted(workers, scheduler, chunk))
@@ -202,7 +200,7 @@ def compare(
     settings, chosen = load(config, tuple(overrides or ())), comparing.names_of(names)
     if out is not None:
         io.check_output("--out", out, ".json", inputs=(data,))
-    dataset = _open(data, dataloader, sequence, settings)
+    dataset = open_data(data, dataloader, sequence, settings)
     frames = runner.choose_frames(dataset, jump, n_scans)
     with pairs_done(len(frames) - 1) as on_pair:
         found = comparing.compare(dataset, frames, chosen, settings, on_pair)
@@ -334,20 +332,11 @@ def show_config() -> None:
 
 def _with_solver(overrides: list[str] | None, solver: str | None) -> tuple[str, ...]:
     """The overrides of settings, and the one that --solver stands for."""
+    from lidarflow.config import Config, updated
+
+    if solver is not None:
+        updated(Config(), {"solver": {"method": solver}}, "--solver")     # names the option that was given
     return (*(overrides or ()), *(() if solver is None else (f"solver.method={solver}",)))
-
-
-def _open(data: Path, dataloader: str | None, sequence: str | None, settings: "Config") -> "Dataset":
-    """The data set, and a word on what it was taken for."""
-    from lidarflow.datasets import open_dataset
-
-    dataset = open_dataset(data, dataloader, sequence, settings.preparation.kitti_correction)
-    guessed = "" if dataloader else " (guessed from what lies there; --dataloader overrides)"
-    print(f"reading    {data}: {len(dataset)} scans")
-    print(f"loader     {dataset.loader}{guessed}")
-    if dataset.note:
-        print(f"note       {dataset.note}")
-    return dataset
 
 
 def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None:

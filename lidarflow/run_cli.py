@@ -37,6 +37,19 @@ class Spread:
         return cls(workers, scheduler, chunk or cluster.CHUNK_PAIRS)
 
 
+def open_data(data: Path, dataloader: str | None, sequence: str | None, settings: "Config") -> "Dataset":
+    """The data set, and a word on what it was taken for."""
+    from lidarflow.datasets import open_dataset
+
+    dataset = open_dataset(data, dataloader, sequence, settings.preparation.kitti_correction)
+    guessed = "" if dataloader else " (guessed from what lies there; --dataloader overrides)"
+    print(f"reading    {data}: {len(dataset)} scans")
+    print(f"loader     {dataset.loader}{guessed}")
+    if dataset.note:
+        print(f"note       {dataset.note}")
+    return dataset
+
+
 @contextlib.contextmanager
 def pairs_done(pairs: int):
     """A bar on standard error; yields what to call with the name of every finished pair."""

@@ -1,5 +1,7 @@
 """What all commands of the command line share: the console, a spinner, and the check for a viewer."""
 
+import itertools
+import re
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -42,6 +44,15 @@ def progress(what: str, total: int):
     bar = Progress(*columns, console=on, disable=not on.is_terminal)
     bar.add_task(what, total=total)
     return bar
+
+
+def check_words(words: list[str]) -> None:
+    """DataError where a word of the command is empty: as a path it would be the working folder."""
+    for before, word in itertools.pairwise(["", *words]):
+        is_option = re.fullmatch(r"--[a-z-]+=", word) is not None
+        if not word or is_option:
+            name = word if is_option else before if before.startswith("-") else "an argument"
+            raise DataError(f"{name.rstrip('=')}: is empty; expected a value, for the working folder a dot")
 
 
 def check_exists(what: Path, expected: str) -> None:

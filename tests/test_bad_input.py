@@ -42,6 +42,15 @@ def test_missing_and_unreadable_folders(lidarflow, tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["empty", "file.bin", "photos"]
 
 
+def test_an_empty_path_is_not_the_working_folder(lidarflow, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    for words, name in ((("run", "", "--out", "../out"), "an argument"), (("run", ".", "--out", ""), "--out"),
+                        (("run", ".", "--out="), "--out"), (("view", ""), "an argument"),
+                        (("rgbd", "run", "", "--out", "../out"), "an argument")):
+        assert lidarflow.complaint(*words).startswith(f"{name}: is empty; expected a value")
+    assert sorted(os.listdir("..")) == ["scans"]
+
+
 def test_a_sequence_of_one_scan(lidarflow, folder, tmp_path):
     for words, found in ((("-n", 1), "1 of 3 scans"), (("-j", 2), "1 of 3"), (("-j", 9), "0 of 3"),
                          (("-n", 0), "0 of 3"), (("-j", -1), "--jump -1"), (("-n", -2), "--n-scans -2")):
