@@ -5,6 +5,7 @@ Heavy packages are imported inside the commands, so that --help answers at once.
 
 import contextlib
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -25,6 +26,7 @@ from lidarflow.terminal import show as _print
 from lidarflow.terminal import working as _working
 
 _INTERRUPTED = 130     # what typer makes of Ctrl-C
+_TERMINATED = 143      # what shells make of SIGTERM
 
 app = typer.Typer(
     help="Dense rigid scene flow: a rigid motion for every LiDAR point between consecutive scans.",
@@ -55,6 +57,7 @@ def main() -> None:
     """Entry point: problems with data or settings become one line and exit code 1."""
     # A terminal that lacks a letter shows another one; that is no reason to lose the results.
     sys.stdout.reconfigure(errors="replace")
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         _check_words(sys.argv[1:])
         app(prog_name="lidarflow")
@@ -65,11 +68,17 @@ def main() -> None:
         print(f"lidarflow: {' '.join(str(error).split()) or 'out of memory'}", file=sys.stderr)
         sys.exit(1)
     except SystemExit as stop:
-        if stop.code == _INTERRUPTED:
-            print("lidarflow: interrupted", file=sys.stderr)
+        if stop.code in (_INTERRUPTED, _TERMINATED):
+            how = "interrupted" if stop.code == _INTERRUPTED else "terminated"
+            print(f"lidarflow: {how}", file=sys.stderr)
         raise
     finally:
         _leave_what_is_stalled()
+
+
+def _terminate(number: int, frame: object) -> None:
+    """End as after Ctrl-C, so that what is half-written is removed."""
+    sys.exit(_TERMINATED)
 
 
 def _leave_what_is_stalled() -> None:

@@ -413,7 +413,9 @@ def test_an_interrupted_demo_leaves_no_half_of_its_data(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent the POSIX way")
-def test_ctrl_c_is_one_line_and_leaves_only_whole_files(scans, tmp_path):
+@pytest.mark.parametrize("sent, code, told", [
+    (signal.SIGINT, cli._INTERRUPTED, "interrupted"), (signal.SIGTERM, 128 + signal.SIGTERM, "terminated")])
+def test_a_signal_is_one_line_and_leaves_only_whole_files(scans, tmp_path, sent, code, told):
     folder = tmp_path / "long"
     folder.mkdir()
     for k in range(20):
@@ -426,10 +428,10 @@ def test_ctrl_c_is_one_line_and_leaves_only_whole_files(scans, tmp_path):
     # In the middle of the work: an interrupt while native packages are imported is the packages' affair.
     while not list((tmp_path / "out" / "flow").glob("*.npz")) and process.poll() is None:
         time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(sent)
     _, err = process.communicate(timeout=60)
-    assert "reading" in line and process.returncode == cli._INTERRUPTED
-    assert err == "lidarflow: interrupted\n" and not rests(tmp_path)
+    assert "reading" in line and process.returncode == code
+    assert err == f"lidarflow: {told}\n" and not rests(tmp_path)
     for file in tmp_path.rglob("*.npz"):
         io.load_flow(file)
 
