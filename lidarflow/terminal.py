@@ -67,7 +67,7 @@ def announce_first_use() -> None:
 
     on = console(sys.stderr)
     if on.is_terminal and not are_cached():
-        on.print("first use: compiling for this machine takes a minute or two; later starts skip it")
+        on.print("first use: compiling for this machine takes one to four minutes; later starts skip it")
 
 
 def check_live_view(wanted: bool) -> None:
