@@ -353,7 +353,7 @@ def _std(
     """
     std_m = found.std_m.copy()
     if config.objects.enabled:
-        own = np.unique(np.concatenate([part.points for part in parts]))
+        own = np.flatnonzero(np.logical_or.reduce([part.graph.variable >= 0 for part in parts]))
         at = points.take(own, axis=0)
         by_own_group = pose.apply(by_group.take(found.owner[own], axis=0), at)
         apart_m = lengths(by_own_group - at - flow.take(own, axis=0))
