@@ -532,13 +532,16 @@ def test_normals():
     check_normals(1500)
 
 
-def test_what_is_narrower_than_wanted_is_a_line_and_has_no_normal():
+def test_a_narrow_piece_has_no_normal_that_faces_the_sensor():
     along = np.linspace(0.0, 1.4, 60)
-    ring = np.column_stack([along, rng(7).normal(0.0, 0.02, (60, 2))]) + [0.0, 10.0, -1.7]
-    strip = np.concatenate([ring, ring + [0.0, 0.3, 0.0]])
-    assert np.isfinite(normals.estimate(ring, ring, 0.7)).all()
-    assert np.isnan(normals.estimate(ring, ring, 0.7, min_width_m=0.05)).all()
-    assert (normals.estimate(strip, strip, 0.7, min_width_m=0.05)[:, 2] > 0.9).all()
+    noise = rng(7).normal(0.0, 1.0, (60, 2))
+    steep, flat = (np.column_stack([along, noise * spread]) + [0.0, 20.0, -1.7]
+                   for spread in ([0.005, 0.02], [0.02, 0.005]))
+    assert np.isfinite(normals.estimate(np.concatenate([steep, flat]), steep, 0.7)).all()
+    assert np.isnan(normals.estimate(steep, steep, 0.7, min_width_m=0.05)).all()
+    assert np.isfinite(normals.estimate(flat, flat, 0.7, min_width_m=0.05)).mean() > 0.8
+    wall = np.concatenate([steep, steep + [0.0, 0.0, 0.4]])
+    assert (np.abs(normals.estimate(wall, wall, 0.7, min_width_m=0.05)[:, 1]) > 0.9).all()
 
 
 def test_normals_without_any_surface_are_nan():

@@ -10,6 +10,7 @@ from lidarflow.kernels.linalg import plane_eigen3
 _MIN_NEIGHBOURS = 4
 _CHUNK = 64          # cells of points that one thread takes at a time
 _MIN_SPREAD = 1e-3   # a neighbourhood thinner than this share of its length is a line, not a surface
+_MOST_FACING = 0.15  # cosine to the line of sight: on a narrow piece noise makes what faces the sensor more
 _ROWS = 3            # of a block: offsets along x, y, z
 _SUMS = 10           # number, offsets, and products of two of them
 
@@ -19,8 +20,8 @@ def estimate(
 ) -> np.ndarray:
     """Unit normals (N, 3) at `points` (N, 3), fitted to `surface` (S, 3) within `radius_m`.
 
-    They face the sensor at the origin. NaN where there are too few neighbours or they lie on a line, as what
-    is narrower than `min_width_m`, a standard deviation, does as well.
+    They face the sensor at the origin. NaN where there are too few neighbours or they lie on a line, and
+    where they are narrower than `min_width_m`, a standard deviation, and not seen from the side.
     """
     asked, seen = cells.build(points, radius_m), cells.build(surface, radius_m)
     return estimated(np.ascontiguousarray(points), asked, np.ascontiguousarray(surface), seen,
@@ -89,8 +90,13 @@ def _fit(p, sums, min_width_m, values, across, normal):
         lanes.total(sums, 4) / count - mx * mx, lanes.total(sums, 5) / count - mx * my,
         lanes.total(sums, 6) / count - mx * mz, lanes.total(sums, 7) / count - my * my,
         lanes.total(sums, 8) / count - my * mz, lanes.total(sums, 9) / count - mz * mz, values, across)
-    if values[1] <= max(_MIN_SPREAD * values[2], min_width_m * min_width_m):
+    if values[1] <= _MIN_SPREAD * values[2]:
         return
-    sign = -1.0 if across[0] * p[0] + across[1] * p[1] + across[2] * p[2] > 0.0 else 1.0
+    facing_m = across[0] * p[0] + across[1] * p[1] + across[2] * p[2]
+    range_sq = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+    is_narrow = values[1] <= min_width_m * min_width_m
+    if is_narrow and facing_m * facing_m > _MOST_FACING * _MOST_FACING * range_sq:
+        return
+    sign = -1.0 if facing_m > 0.0 else 1.0
     for k in range(3):
         normal[k] = sign * across[k]
