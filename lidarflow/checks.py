@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.errors import InputError
-from lidarflow.rows import with_whole_gaps
+from lidarflow.rows import whole_or_nan
 
 _NS_LIMIT = 2**63
 
@@ -37,7 +37,7 @@ def as_points(name: str, points: Any) -> np.ndarray:
     with np.errstate(invalid="ignore", over="ignore"):     # a signalling NaN is a NaN
         if isinstance(found, np.ma.MaskedArray):
             found = np.ma.filled(found.astype(np.float64), np.nan)
-        return with_whole_gaps(np.ascontiguousarray(found, np.float64))
+        return whole_or_nan(np.ascontiguousarray(found, np.float64))
 
 
 def as_time_ns(name: str, time_ns: Any) -> int:

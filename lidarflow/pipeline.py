@@ -317,7 +317,7 @@ def _dense(
     rows = np.flatnonzero(has_own)
     motions[rows] = by_group.take(owner[rows], axis=0)
     for part in parts:
-        rows = part.points
+        rows = part.source_rows
         motions[rows] = part.motions.take(part.graph.variable[rows], axis=0)
         has_own[rows] = True
     rows = np.flatnonzero(has_own)
@@ -361,7 +361,8 @@ def _std(
         return std_m
     if whole.solved.any():
         by_matches = uncertainties.of_matches(whole.graph.problem, whole.motions, config.solver.truncation_m)
-        std_m[whole.points] = np.where(whole.solved, by_matches, np.nan)[whole.graph.variable[whole.points]]
+        rows = whole.source_rows
+        std_m[rows] = np.where(whole.solved, by_matches, np.nan)[whole.graph.variable[rows]]
     return std_m
 
 

@@ -18,7 +18,7 @@ def are_finite(vectors: np.ndarray) -> np.ndarray:
     return np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
 
 
-def with_whole_gaps(vectors: np.ndarray) -> np.ndarray:
+def whole_or_nan(vectors: np.ndarray) -> np.ndarray:
     """Vectors (N, 3) where those that are not finite are NaN as a whole: themselves, or a copy if need be."""
     if np.isfinite(vectors).all():
         return vectors

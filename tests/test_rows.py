@@ -22,12 +22,12 @@ def test_one_number_that_is_not_finite_makes_a_vector_not_finite(vectors):
 
 
 def test_what_is_not_finite_becomes_a_gap_as_a_whole(vectors):
-    assert rows.with_whole_gaps(vectors) is vectors
+    assert rows.whole_or_nan(vectors) is vectors
     vectors[[3, 5]] = np.nan
-    assert rows.with_whole_gaps(vectors) is vectors
+    assert rows.whole_or_nan(vectors) is vectors
     vectors[7, 2], vectors[9, 0], vectors[11] = np.nan, np.inf, (1.0, -np.inf, np.nan)
     given = vectors.copy()
-    found = rows.with_whole_gaps(vectors)
+    found = rows.whole_or_nan(vectors)
     gaps = np.isin(np.arange(len(vectors)), [3, 5, 7, 9, 11])
     assert np.isnan(found[gaps]).all()
     np.testing.assert_array_equal(found[~gaps], given[~gaps])

@@ -25,7 +25,7 @@ class Part:
     solved: np.ndarray
 
     @property
-    def points(self) -> np.ndarray:
+    def source_rows(self) -> np.ndarray:
         """The rows (P,) of the source scan that a variable of the part stands for."""
         return np.flatnonzero(self.graph.variable >= 0)
 
