@@ -282,6 +282,8 @@ def grown_twin(view: view_of_pair.View, seed: np.ndarray, start: np.ndarray, fre
             points, view.source.normals[thinned], view.upright.tree, view.upright.normals, turn,
             pose.apply(motion, centre) - centre, rigid_fit.PLANE_GATES_M, up / np.linalg.norm(up),
             CONFIG.along_ground, 0.05, 0.15, 0.05, MIN_AGREEMENT)
+        if (view.after(body, motion).plane_m**2).sum() > 0.55 * (view.by_ego.plane_m[body]**2).sum():
+            return None
     return Body(body, motion)
 
 
@@ -308,6 +310,26 @@ def test_bodies_grow_step_by_step_and_each_as_if_alone():
     given_up, = body_of.grown(view, seeds[:1], starts[:1], free, least_m + 0.01, CONFIG)
     assert given_up.body is None and given_up.asked.any()
     assert found[0].body is not None and len(found[0].body.rows) > 0.8 * (len(on_box) - 100)
+
+
+def test_a_body_whose_shape_gains_little_is_given_up_as_it_grows(monkeypatch):
+    view = scene(np.array([0.6, 0.0, 0.0]), 14)
+    seeds, start = np.flatnonzero(view.points[:, 0] < 12.0)[::9], pose.from_translation([0.6, 0.0, 0.0])
+    free = np.ones(len(view.points), bool)
+
+    def grow(config: ObjectsConfig) -> body_of.Growth:
+        return body_of.grown(view, [seeds], [start], free, 0.0, config)[0]
+
+    whole = grow(CONFIG)
+    after, at_rest = view.after(whole.body.rows, whole.body.over_ground), view.by_ego[whole.body.rows]
+    left = (after.plane_m**2).sum() / (at_rest.plane_m**2).sum()
+    assert left < 0.2
+    strict = replace(CONFIG, max_shape_ratio=0.0)
+    monkeypatch.setattr(body_of, "_MOST_LEFT", 0.1 * left)
+    given_up = grow(strict)
+    assert given_up.body is None and 0 < given_up.asked.sum() <= whole.asked.sum()
+    # What the settings would accept is not given up before.
+    assert grow(replace(CONFIG, max_shape_ratio=0.5)).body is not None
 
 
 def test_a_body_is_completed_by_what_it_surrounds_and_what_follows_it():

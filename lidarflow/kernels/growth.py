@@ -11,6 +11,7 @@ from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import moved
 
+_TINY = 1e-300
 ASKED, TAKEN = 1, 2   # what growth did with a row; 0 for those it never came near
 
 
@@ -38,7 +39,8 @@ class Limits(NamedTuple):
     min_points, link_m               a body hangs together at this distance, and has so many points
     clearly_better_m, as_good_m      differences between distances that count, and that do not
     cap_m, min_agreement             of distances, as in misfit.after
-    least_shift_m                    what its motion shifts less along the ground is given up
+    least_shift_m                    what its motion shifts less along the ground is given up,
+    most_left                        and what it leaves more of the squared misfit to planes, as a share
     """
 
     first_reach_m: float
@@ -51,6 +53,7 @@ class Limits(NamedTuple):
     cap_m: float
     min_agreement: float
     least_shift_m: float
+    most_left: float
 
 
 class Fit(NamedTuple):
@@ -120,7 +123,8 @@ def _grow(
         if len(rows) < limits.min_points:
             return
         shift_m = _fit(rows, own, target, target_normals, ground, limits, fit, gates_m, motion)
-        if shift_m < limits.least_shift_m:
+        if shift_m < limits.least_shift_m or _share_left(
+                rows, motion, own, target, target_normals, ground, limits, nearest) > limits.most_left:
             return
     did[rows] = TAKEN
 
@@ -146,10 +150,7 @@ def _agreeing(near, free, motion, own, target, target_normals, ground, limits, n
         if not free[row]:
             continue
         x, y, z = moved(own.points[row], motion)
-        place, apart_sq = icp.follow(target, x, y, z, 2.0 * limits.cap_m, row, nearest)
-        plane_m = misfit.plane_distance(
-            x, y, z, place, own.normals[row], motion, target, target_normals, limits.min_agreement)
-        own_m = min(math.sqrt(apart_sq), limits.cap_m)
+        own_m, plane_m = _misfit(x, y, z, row, motion, own, target, target_normals, limits, nearest)
         agrees = _is_explained(own_m, min(plane_m, own_m), row, own, limits)
         if not agrees:     # near ground speaks for a motion, never against it
             below, ground_sq = trees.nearest(ground, x, y, z, own_m * own_m, -1)
@@ -159,6 +160,15 @@ def _agreeing(near, free, motion, own, target, target_normals, ground, limits, n
             rows[count] = row
             count += 1
     return rows[:count]
+
+
+@njit()
+def _misfit(x, y, z, row, motion, own, target, target_normals, limits, nearest):
+    """How far a row is from the target, at most the cap, and from its plane, where the motion took it."""
+    place, apart_sq = icp.follow(target, x, y, z, 2.0 * limits.cap_m, row, nearest)
+    plane_m = misfit.plane_distance(
+        x, y, z, place, own.normals[row], motion, target, target_normals, limits.min_agreement)
+    return min(math.sqrt(apart_sq), limits.cap_m), plane_m
 
 
 @njit()
@@ -172,6 +182,20 @@ def _is_explained(own_m, plane_m, row, own, limits):
         return False
     plane_better = plane_m < ego_plane_m - as_good_m
     return plane_better or (own_m < ego_m + as_good_m and plane_m < ego_plane_m + better_m)
+
+
+@njit()
+def _share_left(rows, motion, own, target, target_normals, ground, limits, nearest):
+    """What the motion leaves of the rows' squared misfit to planes and ground, as a share of that at rest."""
+    left_sq, at_rest_sq = 0.0, 0.0
+    for row in rows:
+        x, y, z = moved(own.points[row], motion)
+        own_m, plane_m = _misfit(x, y, z, row, motion, own, target, target_normals, limits, nearest)
+        left_m = min(plane_m, own_m)
+        _, nearest_sq = trees.nearest(ground, x, y, z, left_m * left_m, -1)
+        left_sq += nearest_sq
+        at_rest_sq += own.by_ego_plane_m[row] ** 2
+    return left_sq / max(at_rest_sq, _TINY)
 
 
 @njit()

@@ -16,6 +16,7 @@ _REACH_M = 0.7           # then by this much at a time
 _GROWTH_ROUNDS = 5
 _CLEARLY_BETTER_M = 0.02
 _AS_GOOD_M = 0.03
+_MOST_LEFT = 0.55        # of the squared misfit of what a body has: of those that move, none leaves 0.29
 _SURROUND_M = 0.35       # whose neighbours at this distance are mostly of the body belongs to it
 _FRAGMENT_M = 1.0        # a fragment this near that follows the body belongs to it: glass returns nothing
 # A body is thinned to fit its motion, which goes along the ground around, if enough of it is seen.
@@ -57,7 +58,8 @@ def grown(
 
     A body looks at what is near to its seeds, keeps what agrees with its motion and hangs together with a
     seed, fits the motion to that, and looks around again, until it comes near nothing new. Only rows that are
-    `free` (N,) may be taken. One that its motion shifts by less than `least_m` along the ground is given up.
+    `free` (N,) may be taken. One that its motion shifts by less than `least_m` along the ground is given up,
+    and one whose shape gains too little to be accepted later: such bodies grow over whole hedges.
 
     The side of a car that moves along itself is explained by either motion, and belongs to the car when
     the car's motion explains it about as well: a row agrees that the motion explains clearly better, or in
@@ -69,7 +71,7 @@ def grown(
         view.points, view.source.normals, view.tolerance_m, view.by_ego.distance_m, view.by_ego.plane_m)
     limits = growth.Limits(
         _FIRST_REACH_M, _REACH_M, _GROWTH_ROUNDS, config.min_points, _LINK_M, _CLEARLY_BETTER_M, _AS_GOOD_M,
-        CAP_M, MIN_AGREEMENT, least_m)
+        CAP_M, MIN_AGREEMENT, least_m, max(_MOST_LEFT, config.max_shape_ratio))
     did, motions = growth.grow_each(
         *rigid_fit.concatenated(seeds), np.stack(starts), free, view.source.tree, own, view.upright.tree,
         view.upright.normals, view.ground, limits, _FIT._replace(along_ground=float(config.along_ground)),
