@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints, overload
 
+import numpy as np
+
 from lidarflow.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -235,10 +237,12 @@ def load(file: Path | str | None = None, overrides: tuple[str, ...] = (), kind: 
 
 
 def given(config: Any, kind: type[Settings]) -> Settings:
-    """Settings of a `kind` as they are, its defaults for None; ConfigError for anything else."""
+    """Settings of a `kind`, each of them checked, its defaults for None; ConfigError for anything else."""
     if config is None:
         return kind()
     if isinstance(config, kind):
+        config = updated(config, to_dict(config))
+        _check_together(config)
         return config
     found, file = f"of type {type(config).__name__}", "file"
     if isinstance(config, str | Path):
@@ -256,7 +260,9 @@ def updated(config: Settings, changes: dict, origin: str = "settings") -> Settin
         if not isinstance(values, dict):
             raise ConfigError(f"{origin}: '{section}' is a section, write it as [{section}]")
         current = getattr(config, section)
-        checked = {name: _check(current, section, name, value, origin) for name, value in values.items()}
+        kinds = get_type_hints(type(current))
+        checked = {name: _check(current, kinds, section, name, value, origin)
+                   for name, value in values.items()}
         config = replace(config, **{section: replace(current, **checked)})
     return config
 
@@ -309,13 +315,17 @@ def _parse_override(override: str) -> dict:
     return {section: {name: value}}
 
 
-def _check(section_config: Any, section: str, name: str, value: Any, origin: str) -> Any:
+def _check(
+    section_config: Any, kinds: dict[str, type], section: str, name: str, value: Any, origin: str
+) -> Any:
     """`value` converted to the setting's type, or a ConfigError that says what was expected."""
     known = {f.name: f for f in fields(section_config)}
     if name not in known:
         raise ConfigError(f"{origin}: unknown setting '{section}.{name}'{_nearest(name, known)}")
-    kind, meta = get_type_hints(type(section_config))[name], known[name].metadata
+    kind, meta = kinds[name], known[name].metadata
     key = f"{origin}: {section}.{name}"
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, int) and abs(value) >= _TOO_LARGE:
         raise ConfigError(f"{key}: the number is too large")
     if kind is float and isinstance(value, int) and not isinstance(value, bool):

@@ -1,12 +1,14 @@
 """Settings: who overrides whom, and that no mistake passes silently."""
 
-from dataclasses import FrozenInstanceError, fields
+from dataclasses import FrozenInstanceError, fields, replace
 
+import numpy as np
 import pytest
 from shared_data import ROOT
 
-from lidarflow.config import Config, describe, load, read_toml, to_dict, updated
+from lidarflow.config import Config, describe, given, load, read_toml, to_dict, updated
 from lidarflow.errors import ConfigError
+from lidarflow.pipeline import FlowEstimator, estimate_flow
 from lidarflow.rgbd_config import RgbdConfig
 
 FILES = ([(Config, file) for file in sorted((ROOT / "configs").glob("*.toml"))]
@@ -90,12 +92,36 @@ def test_a_mistake_in_a_file_names_the_file(tmp_path, text, message):
 def test_limits_that_leave_no_range_are_refused_wherever_they_come_from(tmp_path):
     file = toml(tmp_path, "[preparation]\nmin_range_m = 100.0\n")
     message = r"preparation\.min_range_m: expected less than max_range_m, which is 80\.0, got 100\.0"
-    for given in ((file, ()), (None, ("preparation.min_range_m=100",))):
+    for origin in ((file, ()), (None, ("preparation.min_range_m=100",))):
         with pytest.raises(ConfigError, match=message):
-            load(*given)
+            load(*origin)
     with pytest.raises(ConfigError, match=r"which is 5\.0, got 5\.0"):
         load(None, ("preparation.max_range_m=5", "preparation.min_range_m=5"))
     assert load(file, ("preparation.max_range_m=200",)).preparation.min_range_m == 100.0
+
+
+@pytest.mark.parametrize(("section", "value", "message"), [
+    ("solver", replace(Config().solver, method="quick"), r"solver\.method: expected one of fast, gtsam"),
+    ("refine", replace(Config().refine, rounds=1.5), r"refine\.rounds: expected int, got 1\.5"),
+    ("preparation", replace(Config().preparation, min_range_m=90.0), r"min_range_m: expected less than"),
+    ("mesh", None, "'mesh' is a section"),
+])
+def test_settings_made_by_hand_are_checked_where_they_are_given(section, value, message):
+    by_hand = replace(Config(), **{section: value})
+    scans = np.zeros((2, 10, 3))
+    for use in (lambda: FlowEstimator(by_hand), lambda: estimate_flow((scans[0], scans[1]), by_hand)):
+        with pytest.raises(ConfigError, match=message) as caught:
+            use()
+        assert str(caught.value).startswith("settings: ")
+
+
+def test_settings_made_by_hand_may_hold_whole_numbers_and_numpy_ones():
+    by_hand = replace(Config(), refine=replace(Config().refine, rounds=np.int64(3), reach_m=np.float32(0.5)),
+                      solver=replace(Config().solver, data_weight=2))
+    found = given(by_hand, Config)
+    assert found.refine.rounds == 3 and type(found.refine.rounds) is int
+    assert found.refine.reach_m == 0.5 and type(found.solver.data_weight) is float
+    assert given(Config(), Config) == Config() == given(None, Config)
 
 
 def test_files_that_cannot_be_read_are_errors_too(tmp_path):
