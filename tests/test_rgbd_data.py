@@ -312,6 +312,10 @@ def test_numbered_images_in_one_folder(tmp_path):
     found = open_rgbd(tmp_path)
     assert len(found) == 3 and "pixel/5000" in str(found.notes) and found.camera == QVGA
     np.testing.assert_allclose(found.frame(1).depth, frames()[1][0].depth, atol=2.1e-4)
+    (tmp_path / "color_01.png").write_bytes((tmp_path / "color1.png").read_bytes())
+    with pytest.raises(DataError, match=r"color1\.png and color_01\.png have one number"):
+        open_rgbd(tmp_path)
+    (tmp_path / "color_01.png").unlink()
     (tmp_path / "depth1.png").unlink()
     with pytest.raises(DataError, match="3 images named color<number> and 2 named depth<number>"):
         open_rgbd(tmp_path)

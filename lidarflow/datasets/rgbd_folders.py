@@ -211,9 +211,7 @@ def _image_folders(folder: Path, color_folder: str) -> _Listing:
 
 def _numbered_images(folder: Path) -> _Listing:
     """Images color0.png, color1.png … and depth0.png, depth1.png … in one folder."""
-    by_kind = {kind: {frame_number(file): file for file in _images(folder)
-                      if re.fullmatch(rf"{kind}[-_]?\d+", file.stem, re.IGNORECASE)}
-               for kind in ("color", _DEPTH_FOLDER)}
+    by_kind = {kind: _by_number(folder, kind) for kind in ("color", _DEPTH_FOLDER)}
     numbers = [sorted(files) for files in by_kind.values()]
     if numbers[0] != numbers[1] or not numbers[0]:
         raise DataError(f"{folder}: {len(numbers[0])} images named color<number> and {len(numbers[1])} named "
@@ -221,6 +219,18 @@ def _numbered_images(folder: Path) -> _Listing:
                         "color0.png depth0.png color1.png depth1.png …")
     color, depth = ([by_kind[kind][number] for number in numbers[0]] for kind in by_kind)
     return _untimed(color, depth, DEFAULT_DEPTH_SCALE, folder / "trajectory.log")
+
+
+def _by_number(folder: Path, kind: str) -> dict[int | None, Path]:
+    """The images named kind<number>, by their numbers; DataError where two have one number."""
+    found: dict[int | None, Path] = {}
+    for file in _images(folder):
+        if re.fullmatch(rf"{kind}[-_]?\d+", file.stem, re.IGNORECASE):
+            other = found.setdefault(frame_number(file), file)
+            if other != file:
+                raise DataError(f"{folder}: {other.name} and {file.name} have one number; expected one image "
+                                f"named {kind}<number> for each")
+    return found
 
 
 def _untimed(color: list[Path], depth: list[Path], depth_scale: float, pose_file: Path) -> _Listing:
