@@ -146,6 +146,11 @@ def save_flow(path: Path, points: np.ndarray, result: FlowResult, config: Config
         aside.write_bytes(archive(arrays))
 
 
+def is_whole(path: Path) -> bool:
+    """Whether a flow file is there and was not cut off, as far as its table of contents tells."""
+    return zipfile.is_zipfile(path)
+
+
 def load_flow(path: Path) -> FlowFile:
     """Read a flow file; DataError where it is damaged, or not a flow file."""
     arrays = read_archive(Path(path), (*_ROW_ARRAYS, *_WHOLE_ARRAYS))
@@ -332,7 +337,7 @@ def read_archive(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     if not path.is_file():
         found = "is a folder" if path.is_dir() else "no such file"
         raise DataError(f"{path}: {found}; expected a flow file (.npz)")
-    if not zipfile.is_zipfile(path):
+    if not is_whole(path):
         raise DataError(f"{path}: not an .npz archive, or a truncated one; expected a flow file")
     try:
         return arrays.from_npz(path, names)

@@ -1,7 +1,6 @@
 """Whether a run folder holds the beginning of the run that is asked for, or all of it."""
 
 import json
-import zipfile
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -69,16 +68,13 @@ def state_of(out: Path, plan: Plan) -> State:
 
 
 def damaged_files(out: Path) -> list[str]:
-    """Names in a complete run's folder of what other commands need and is missing, or of a flow file cut off.
-
-    Flow files are not read: one whose table of contents is there counts as whole.
-    """
+    """Names in a complete run's folder of what other commands need and is missing, or cut off."""
     try:
         frames = list(json.loads((out / io.TIMING_FILE).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, RecursionError):
         return [io.TIMING_FILE]
     flows = [f"{io.FLOW_FOLDER}/{frame}.npz" for frame in frames]
-    damaged = [name for name in flows if not zipfile.is_zipfile(out / name)]
+    damaged = [name for name in flows if not io.is_whole(out / name)]
     return damaged if (out / "poses_tum.txt").is_file() else [*damaged, "poses_tum.txt"]
 
 

@@ -86,8 +86,6 @@ def load_flow(path: Path) -> RgbdFlowFile:
 
 def is_rgbd_flow(path: Path) -> bool:
     """Whether a file is a flow file of an RGB-D pair, as far as its table of contents tells."""
-    if not zipfile.is_zipfile(path):
-        return False
     try:
         with zipfile.ZipFile(path) as archive:
             return f"{_MARK}.npy" in archive.namelist()

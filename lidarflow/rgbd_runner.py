@@ -1,7 +1,6 @@
 """A whole run over RGB-D frames: a folder of images in, a folder of results out."""
 
 import time
-import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -85,7 +84,7 @@ def _write_pair(folder: RgbdFolder, step: Step, plan: Plan, out: Path, stream, w
     report = report_pair(pair, result, folder.truth(step.index), folder.world_from_camera(), step.index)
     file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
     # A checkpoint is younger than its flow file, which may have been cut off since.
-    if not (step.restored and zipfile.is_zipfile(file)):
+    if not (step.restored and io.is_whole(file)):
         rgbd_io.save_flow(file, pair.source, result, plan.config, stats_of(plan.method, report))
     world_from_source = way.reached(step.index)
     if stream is not None:

@@ -3,7 +3,6 @@
 import contextlib
 import itertools
 import time
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
@@ -203,7 +202,7 @@ def _write_pair(
     file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
     with Aside() as beside:
         # A checkpoint is younger than its flow file, which may have been cut off since.
-        if not (step.restored and zipfile.is_zipfile(file)):
+        if not (step.restored and io.is_whole(file)):
             saved = beside.begin(io.save_flow, file, pair.source.points, result, config)
         else:
             saved = there(None)

@@ -31,7 +31,8 @@ def test_what_is_no_return_is_masked_whatever_the_limits():
     limits = PreparationConfig(min_range_m=0.0, max_range_m=np.inf)
     kept = preparation.usable(points, limits)
     np.testing.assert_array_equal(kept, [True, False, False, False, False, True, False, False, True])
-    np.testing.assert_array_equal(thinning.in_range(points, 0.0, np.inf)[0], points[kept])
+    in_range, _ = thinning.in_range(points, *preparation.range_limits_m(limits))
+    np.testing.assert_array_equal(in_range, points[kept])
 
 
 def distance_to(parts, points: np.ndarray) -> np.ndarray:

@@ -10,8 +10,6 @@ from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.tree import Tree
 
-NEAREST_M = 1e-3          # nearer than this lie no returns: files have zeros where there was no echo
-FARTHEST_M = 1e4          # nor farther, whatever the limits: int32 has to do for counting cells
 _LEAST_RADIUS_M = 1e-6    # of a place that is one point
 
 
@@ -19,14 +17,13 @@ _LEAST_RADIUS_M = 1e-6    # of a place that is one point
 def in_range(points, min_range_m, max_range_m):
     """Those (M, 3) of points (N, 3) whose range lies between the two, and their median range; none have 0.
 
-    Points that are not finite have no range, nor have those that are nearer or farther than any return.
+    Points that are not finite have no range.
     """
-    least_sq, most_sq = max(min_range_m, NEAREST_M) ** 2, min(max_range_m, FARTHEST_M) ** 2
     found, range_sq, count = np.empty_like(points), np.empty(len(points)), 0
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         own_sq = x * x + y * y + z * z
-        if least_sq <= own_sq <= most_sq:
+        if min_range_m * min_range_m <= own_sq <= max_range_m * max_range_m:
             found[count, 0], found[count, 1], found[count, 2] = x, y, z
             range_sq[count] = own_sq
             count += 1

@@ -10,6 +10,7 @@ from lidarflow.errors import DataError
 from lidarflow.kernels import grid, icp, neighbours, thinning
 from lidarflow.kernels import registration as kernel
 from lidarflow.kernels.tree import Tree
+from lidarflow.lidar import preparation
 from lidarflow.open3d_import import open3d
 
 _SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range: indoors all is smaller
@@ -75,7 +76,7 @@ class Planes:
         Raises DataError where too few are left.
         """
         means, tree, normals, voxel_m, count = thinning.thinned(
-            points, limits.min_range_m, limits.max_range_m, wanted_m, _SCENE_VOXEL_SHARE,
+            points, *preparation.range_limits_m(limits), wanted_m, _SCENE_VOXEL_SHARE,
             _NORMAL_RADIUS_VOXELS, _MIN_WIDTH_VOXELS)
         _require_enough(means, count, voxel_m)
         return means, cls(tree, normals), voxel_m
