@@ -234,11 +234,16 @@ def check_run_folder(out: Path) -> None:
         names = {entry.name for entry in out.iterdir()} if out.is_dir() else set()
     except OSError as error:
         raise DataError(f"cannot write {out}: {error.strerror or error}; choose another --out") from error
-    if names and not _is_run(names):
+    if names and not _are_a_run(names):
         some = ", ".join(sorted(names)[:3])
         raise DataError(f"{out}: holds files that are not an earlier run's ({some}); "
                         "choose a new or an empty folder as --out")
     _check_parents("--out", out)
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds an earlier run, finished or cut short."""
+    return folder.is_dir() and _are_a_run({entry.name for entry in folder.iterdir()})
 
 
 def find_recording(what: Path) -> Path:
@@ -314,7 +319,7 @@ def _links_to_a_run(link: Path) -> bool:
     """Whether `link` is one that `link_latest` made: to a run beside it, or to one that is gone."""
     if not link.is_symlink() or os.sep in os.readlink(link):
         return False
-    return not link.exists() or (link.is_dir() and _is_run({entry.name for entry in link.iterdir()}))
+    return not link.exists() or is_run(link)
 
 
 def _check_parents(option: str, path: Path) -> None:
@@ -326,8 +331,8 @@ def _check_parents(option: str, path: Path) -> None:
         raise DataError(f"{option} {path}: {nearest} cannot be written to; choose another {option}")
 
 
-def _is_run(names: set[str]) -> bool:
-    """Whether a folder with these entries is an earlier run, finished or cut short."""
+def _are_a_run(names: set[str]) -> bool:
+    """Whether these are the entries of an earlier run's folder."""
     names = {name for name in names if not is_left_over(name)}
     return FLOW_FOLDER in names and (CONFIG_FILE in names or names <= {FLOW_FOLDER, SOURCE_FILE})
 

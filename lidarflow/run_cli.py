@@ -63,9 +63,16 @@ def process(
     method: str = "ours", going: "Going | None" = None, spread: Spread | None = None,
 ) -> None:
     """Run over a data set and say what was found."""
-    from lidarflow import runner
+    from lidarflow import io, runner
     from lidarflow.resuming import damaged_files
-    from lidarflow.tables import complete_line, run_notes, run_table, skipped_lines, where_results_are
+    from lidarflow.tables import (
+        complete_line,
+        replaced_line,
+        run_notes,
+        run_table,
+        skipped_lines,
+        where_results_are,
+    )
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(dataset, jump, n_scans)
@@ -76,6 +83,9 @@ def process(
         print(complete_line(out, damaged))
         if not damaged:
             return
+    io.check_run_folder(out)
+    if not going.resume and io.is_run(out):
+        print(replaced_line(out))
     if spread is not None:
         _compute(dataset, frames, settings, out, method, going, spread)
         going = replace(going, resume=True)

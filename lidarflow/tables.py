@@ -169,6 +169,11 @@ def complete_line(out: Path, damaged: list[str]) -> str:
     return f"damaged    {out}: {damaged[0]}{others} missing or cut off; all pairs are computed anew"
 
 
+def replaced_line(out: Path) -> str:
+    """What is said where `out` holds an earlier run that is not gone on with."""
+    return f"replacing  {out}: holds an earlier run, which the results of this one replace"
+
+
 def where_results_are(out: Path, is_recorded: bool) -> list[str]:
     """What a run over a sequence says at its end, a line each."""
     told = [f"results    {out}", f"metrics    {out / 'metrics.json'}",

@@ -290,9 +290,11 @@ def test_the_same_input_gives_the_same_bytes(lidarflow, finished, kitti, tmp_pat
 
 
 def test_a_run_may_start_later_and_end_earlier(lidarflow, scans, tmp_path):
-    lidarflow.ok("run", scans[0].parent, "-j", 1, "-n", 2, "--out", tmp_path / "out", "--no-record")
+    told = lidarflow.ok("run", scans[0].parent, "-j", 1, "-n", 2, "--out", tmp_path / "out", "--no-record")
+    assert "replacing" not in told
     assert os.listdir(tmp_path / "out" / "flow") == ["000001.npz"]
-    lidarflow.ok("run", scans[0].parent, "-n", 2, "--out", tmp_path / "out", "--no-record")
+    told = lidarflow.ok("run", scans[0].parent, "-n", 2, "--out", tmp_path / "out", "--no-record")
+    assert f"replacing  {tmp_path / 'out'}: holds an earlier run" in told
     assert os.listdir(tmp_path / "out" / "flow") == ["000000.npz"], "an earlier run's would be taken for new"
 
 

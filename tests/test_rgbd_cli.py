@@ -208,10 +208,12 @@ def test_a_run_carries_its_state_along_and_chains_its_poses(finished, folder):
 
 def test_a_run_again_gives_the_same_bytes(lidarflow, finished, folder, tmp_path):
     out, _ = finished
-    lidarflow.ok("rgbd", "run", folder, "--out", "b", "--no-record")
+    assert "replacing" not in lidarflow.ok("rgbd", "run", folder, "--out", "b", "--no-record")
     for name in (*SAME, "flow/0.000000.npz", "flow/0.066667.npz"):
         assert (out / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
     assert not (tmp_path / "b" / "recording.rrd").exists()
+    assert "replacing  b: holds an earlier run" in lidarflow.ok(
+        "rgbd", "run", folder, "-n", 2, "--out", "b", "--no-record")
 
 
 def test_part_of_a_sequence_by_another_method(lidarflow, folder, tmp_path):
