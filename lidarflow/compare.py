@@ -92,7 +92,16 @@ def compare(
         found.frames.append(pair.source.name)
         found.truth.append(origin)
         on_pair(pair.source.name)
+    _leave_out_poorer_truth(found)
     return found
+
+
+def _leave_out_poorer_truth(found: Comparison) -> None:
+    """Leave but crispness of pairs whose truth is poorer than that of others, which is known at the end."""
+    for k in runner.poorer(found.truth):
+        found.truth[k] = runner.NO_TRUTH
+        for run in found.runs:
+            run.figures[k] = {"crispness": run.figures[k]["crispness"]}
 
 
 def _pairs(dataset: Dataset, frames: list[int], runs: list[MethodRun], config: Config):

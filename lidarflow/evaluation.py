@@ -35,7 +35,7 @@ class Evaluation:
     @property
     def truth(self) -> str:
         """What the pairs were scored against."""
-        return runner.truth_of(self.reports)
+        return runner.truth_of([report.truth for report in self.reports])
 
     def metrics(self) -> dict:
         """What metrics.json holds."""
@@ -209,9 +209,9 @@ def _check_truths(place: str, reports: list[PairReport]) -> None:
     without = [report.frame for report in reports if report.scores is None]
     if len(without) == len(reports):
         raise DataError(f"{place}: no truth (neither flow, nor boxes and poses, nor poses); give --truth")
-    poorer = without or [report.frame for report in reports if report.truth == metrics.POSES_ONLY]
-    if 0 < len(poorer) < len(reports):
-        raise DataError(f"{place}: no truth of {_some(poorer)}, but of the other scans; "
+    lacking = without or [reports[k].frame for k in runner.poorer([report.truth for report in reports])]
+    if lacking:
+        raise DataError(f"{place}: no truth of {_some(lacking)}, but of the other scans; "
                         "get the missing truth, or run without these scans")
 
 

@@ -4,7 +4,7 @@ import contextlib
 import itertools
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from lidarflow.rgbd_config import RgbdConfig
 
 OUTPUT_STAGE = "scores and output"     # the stage after those of the method itself
+NO_TRUTH = "none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +106,9 @@ def process(
 
     `method` is one of methods.METHODS. Flow files are complete as soon as they appear; poses, objects,
     metrics, recording and picture follow. Until then every pair is kept as a checkpoint too, from which
-    `going.resume` goes on. Raises LidarflowError for input or output that cannot be used.
+    `going.resume` goes on. Whether a pair's truth is as good as that of the others is known at the end: what
+    is returned and written may lack scores that `on_pair` heard of (`without_poorer_truth`). Raises
+    LidarflowError for input or output that cannot be used.
     """
     going = going or Going()
     plan, kept = plan_of(dataset, frames, config, method, going), Checkpoints(out)
@@ -119,6 +122,7 @@ def process(
                 kept.save(step.index, step.pair, step.result, step.tracks)
             objects += _object_rows(step.pair.source.name, step.result)
             on_pair(reports[-1])
+    reports = without_poorer_truth(reports)
     way.write(out)
     io.write_objects(out / io.OBJECTS_FILE, objects)
     with io.written_aside(out / "preview.png") as aside:
@@ -227,15 +231,13 @@ def metrics_of(reports: list[PairReport], config: Config) -> dict:
     """What metrics.json holds; wall times are kept elsewhere, so that equal runs are equal.
 
     mean, std  of the figures of every pair, over pairs
-    three_way, bucketed, by_range, by_speed   over the points of all pairs, where all of them have a truth
+    three_way, bucketed, by_range, by_speed   over the points of all pairs, where all have one kind of truth
     pairs      what is known of every pair
     """
-    spread = _over_pairs(reports)
-    scored = [report.scores for report in reports if report.scores is not None]
-    whole = metrics.pool(scored) if scored and len(scored) == len(reports) else None
+    spread, whole = _over_pairs(reports), pooled(reports)
     return {
         "crispness_sigma_m": config.crispness.sigma_m,
-        "truth": truth_of(reports),
+        "truth": truth_of([report.truth for report in reports]),
         "mean": {name: mean for name, (mean, _) in spread.items()},
         "std": {name: std for name, (_, std) in spread.items()},
         **({} if whole is None else _plain_pooled(whole)),
@@ -248,12 +250,36 @@ def mean_of(reports: list[PairReport]) -> dict[str, float]:
     return {name: mean for name, (mean, _) in _over_pairs(reports).items()}
 
 
-def truth_of(reports: list[PairReport]) -> str:
-    """What the pairs were scored against, e.g. "flow" or "flow (4 pairs), none (1)"."""
-    counts = Counter(report.truth for report in reports)
+def pooled(reports: list[PairReport]) -> metrics.Pooled | None:
+    """Scores over the points of all pairs; None where a pair has none, or another kind of truth."""
+    scored = [report.scores for report in reports if report.scores is not None]
+    alike = len(scored) == len(reports) and len({report.truth for report in reports}) == 1
+    return metrics.pool(scored) if alike else None
+
+
+def truth_of(origins: Sequence[str]) -> str:
+    """What pairs were scored against, by their truths' origins, e.g. "flow (4 pairs), none (1 pair)"."""
+    counts = Counter(origins)
     if len(counts) == 1:
-        return reports[0].truth
-    return ", ".join(f"{origin} ({count} pairs)" for origin, count in counts.items())
+        return origins[0]
+    return ", ".join(f"{origin} ({count} pair{'s' if count > 1 else ''})" for origin, count in counts.items())
+
+
+def poorer(origins: Sequence[str]) -> list[int]:
+    """Which pairs have a truth of poses alone while others have a better one; `origins` of their truths.
+
+    Poses take what moves as static, so figures of such pairs are of another kind than those of the others.
+    """
+    if not set(origins) - {metrics.POSES_ONLY, NO_TRUTH}:
+        return []
+    return [k for k, origin in enumerate(origins) if origin == metrics.POSES_ONLY]
+
+
+def without_poorer_truth(reports: list[PairReport]) -> list[PairReport]:
+    """The reports, those with a `poorer` truth as if they had none."""
+    poor = poorer([report.truth for report in reports])
+    return [replace(report, scores=None, truth=NO_TRUTH) if k in poor else report
+            for k, report in enumerate(reports)]
 
 
 def _over_pairs(reports: list[PairReport]) -> dict[str, tuple[float, float]]:
@@ -296,7 +322,7 @@ def find_truth(dataset: Dataset, index: int, pair: ScanPair) -> tuple[Truth | No
         return truth, truth.origin
     world_from_sensor = dataset.world_from_sensor()
     if world_from_sensor is None:
-        return None, "none"
+        return None, NO_TRUTH
     ego_motion = pose.inverse(world_from_sensor[index + 1]) @ world_from_sensor[index]
     truth = metrics.static_truth(pair.source.points, ego_motion)
     return truth, truth.origin

@@ -6,8 +6,18 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from lidarflow import runner
 from lidarflow.evaluation import Evaluation
-from lidarflow.metrics import Accuracy, Bucketed, ErrorSummary, Interval, Scores, ThreeWay, over_frames, pool
+from lidarflow.metrics import (
+    Accuracy,
+    Bucketed,
+    ErrorSummary,
+    Interval,
+    Pooled,
+    Scores,
+    ThreeWay,
+    over_frames,
+)
 
 _PER_CENT, _DEGREES = 100.0, 180.0 / np.pi
 
@@ -15,12 +25,16 @@ _PER_CENT, _DEGREES = 100.0, 180.0 / np.pi
 def tables_of(done: Evaluation) -> list[Table]:
     """Every table that an evaluation fills."""
     scores = [report.scores for report in done.reports]
-    whole = pool(scores)
-    by_class = [] if whole.bucketed is None else [class_table(whole.bucketed)]
-    return [error_table(scores), three_way_table(whole.three_way), *by_class,
-            interval_table("by range [m]", whole.by_range),
-            interval_table("by speed [m a frame]", whole.by_speed),
+    whole = runner.pooled(done.reports)
+    return [error_table(scores), *([] if whole is None else _pooled_tables(whole)),
             frame_table(scores, all_points=not done.config.objects.enabled)]
+
+
+def _pooled_tables(whole: Pooled) -> list[Table]:
+    """The tables over the points of all pairs."""
+    by_class = [] if whole.bucketed is None else [class_table(whole.bucketed)]
+    return [three_way_table(whole.three_way), *by_class, interval_table("by range [m]", whole.by_range),
+            interval_table("by speed [m a frame]", whole.by_speed)]
 
 
 def error_table(scores: Sequence[Scores]) -> Table:

@@ -10,7 +10,7 @@ from lidarflow import pose
 from lidarflow.compare import Comparison
 from lidarflow.config import Config, describe
 from lidarflow.metrics import Alignment
-from lidarflow.runner import PairReport, figures_of, mean_of, truth_of
+from lidarflow.runner import NO_TRUTH, PairReport, figures_of, mean_of, truth_of
 from lidarflow.stepping import Skipped
 from lidarflow.types import FlowResult, ScanPair
 
@@ -63,12 +63,13 @@ def run_table(reports: list[PairReport], config: Config) -> Table:
 def run_notes(reports: list[PairReport], config: Config) -> list[str]:
     """What the figures of `run_table` mean, and which pairs look wrong."""
     notes = [f"crisp: crispness with σ = {config.crispness.sigma_m:g} m, 1 = aligned, of points above ground"]
-    if reports[0].scores is None:
+    origins = [report.truth for report in reports]
+    if set(origins) == {NO_TRUTH}:
         notes.insert(0, "truth: none found")
     else:
         graph = [] if config.objects.enabled else [
             "graph: the same of the points the graph solved; others have the ego-motion"]
-        notes = [f"truth: {truth_of(reports)}", "EPE: mean end-point error of all points", *graph, *notes]
+        notes = [f"truth: {truth_of(origins)}", "EPE: mean end-point error of all points", *graph, *notes]
     for report in reports:
         doubt = _doubt(report.matches, report.seconds, report.alignment)
         notes += [f"{report.frame}: {doubt}"] if doubt else []
@@ -93,11 +94,11 @@ def compare_table(found: Comparison) -> Table:
 
 def compare_notes(found: Comparison) -> list[str]:
     """What the figures of `compare_table` mean."""
-    truth = ", ".join(dict.fromkeys(found.truth))
+    truth = truth_of(found.truth)
     notes = [f"pairs: {len(found.frames)}; means over pairs, time: median after one unmeasured pair",
              f"crisp: crispness with σ = {found.config.crispness.sigma_m:g} m, 1 = aligned, of all points "
              "above ground"]
-    if truth == "none":
+    if truth == NO_TRUTH:
         return ["truth: none found", *notes]
     return [f"truth: {truth}", *notes, "EPE: mean end-point error of all points with a known truth",
             "t_e, r_e: error of the motion at a point, of static points above ground"]

@@ -44,15 +44,15 @@ def evaluate(job: tuple[Path, int | None, settings.Config]) -> dict:
     for _ in pipeline.run(dataset, frames[:2], pipeline.FlowEstimator(config)):
         pass
     results = pipeline.run(dataset, frames, pipeline.FlowEstimator(config))
-    reports = [
+    reports = runner.without_poorer_truth([
         runner.report_pair(dataset, index, pair, result, config)
         for index, (pair, result) in zip(frames, results, strict=False)
-    ]
+    ])
     stages = dict.fromkeys(stage for report in reports for stage in report.seconds)
     return {
         "folder": folder.name,
         "pairs": len(reports),
-        "truth": reports[0].truth,
+        "truth": runner.truth_of([report.truth for report in reports]),
         "points": float(np.mean([report.points for report in reports])),
         "graph_points": float(np.mean([report.graph_points for report in reports])),
         "scores": runner.mean_of(reports),

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,13 +10,14 @@ from cloud_files import write_bin
 from command_line import drive, rests
 from run_folders import OFF_M, write_run
 
-from lidarflow import provenance, synthetic
+from lidarflow import evaluation, metrics, provenance, runner, synthetic
 from lidarflow.datasets import open_dataset
 from lidarflow.types import Scan, Truth
 
 pytestmark = pytest.mark.usefixtures("in_tmp_path")
 
 SCANS = ("000000", "000001")
+OFF = ("--set", "preparation.kitti_correction=off")
 
 
 @pytest.fixture
@@ -106,6 +108,36 @@ def test_poses_alone_make_a_static_scene(lidarflow, data, run):
     mean = metrics_of(run)["mean"]
     assert mean["epe_static_m"] > 1.05 * OFF_M, "movers count as static"
     assert "epe_dynamic_m" not in mean
+
+
+def test_a_run_takes_no_poses_for_truth_beside_a_better_one(lidarflow, data, tmp_path):
+    """Whichever pair lacks its file: truths are known one by one, while the run goes on."""
+    for lacks, has in (SCANS, SCANS[::-1]):
+        (truth_folder(data) / f"{lacks}.npz").rename(tmp_path / "aside.npz")
+        out = lidarflow.ok("run", data, *OFF, "--method", "zero", "--no-record", "--out", "mixed")
+        assert "none (1 pair)" in out and "flow (1 pair)" in out
+        found = metrics_of(tmp_path / "mixed")
+        scores = {pair["frame"]: pair["scores"] for pair in found["pairs"]}
+        assert scores[lacks] is None
+        assert found["mean"]["epe_static_m"] == scores[has]["static"]["mean"]
+        assert "flow (1 pair)" in found["truth"] and "none (1 pair)" in found["truth"]
+        assert "three_way" not in found, "not of all pairs"
+        lidarflow.ok("report", "mixed")
+        out = lidarflow.ok("compare", data, *OFF, "--methods", "zero", "--out", "all.json")
+        assert "none (1 pair)" in out
+        compared = metrics_of(tmp_path, "all.json")["methods"]["zero"]["pairs"]
+        assert set(compared[SCANS.index(lacks)]) == {"crispness"}
+        (tmp_path / "aside.npz").rename(truth_folder(data) / f"{lacks}.npz")
+
+
+def test_figures_of_two_kinds_of_truth_are_not_pooled(data, run):
+    done = evaluation.evaluate_run(run)
+    first, second = done.reports
+    assert runner.pooled(done.reports) is not None
+    assert runner.pooled([first, replace(second, truth="boxes")]) is None
+    assert runner.truth_of(["boxes", "flow", "flow"]) == "boxes (1 pair), flow (2 pairs)"
+    assert runner.poorer(["flow", metrics.POSES_ONLY, "none"]) == [1]
+    assert runner.poorer(["none", metrics.POSES_ONLY]) == []
 
 
 def test_classes_of_the_truth_are_scored(lidarflow, data, run):

@@ -157,7 +157,8 @@ def _pictures(run_dir: Path, pairs: tuple[PairReport, ...], numbers: list[int]
         if pair is not None and pair.source.name != frame:
             raise DataError(f"{run_dir / io.METRICS_FILE}: pair {number} is of scan {frame}, but that of the "
                             f"data is of {pair.source.name}; run again")
-        drawn.append(_picture(files[frame], frame, pair, truth))
+        scored = pairs[number].scores is not None     # what was no truth for scores is none for a picture
+        drawn.append(_picture(files[frame], frame, pair, truth if scored else None))
     if reason:
         return tuple(drawn), f"No error maps, and arrows drawn as if scans were 0.1 s apart: {reason}."
     if all(picture.errors is None for picture in drawn):
