@@ -85,6 +85,11 @@ def known_rows(result: FlowResult, truth: Truth) -> np.ndarray:
     return truth.valid & np.isfinite(result.flow).all(axis=1)
 
 
+def rows_above_ground(result: FlowResult, truth: Truth) -> np.ndarray:
+    """What the bucketed score counts: the challenge reads data `with_ground=False`, which masks ground."""
+    return known_rows(result, truth) & ~truth.is_ground
+
+
 def of_av2(pairs: list[Pair]) -> dict[str, float]:
     """What av2 makes of the pairs: means over points, then pairs, and the figures of its leaderboard."""
     columns, whole = defaultdict(list), defaultdict(list)
@@ -124,7 +129,7 @@ def of_bucketed(pairs: list[Pair]) -> dict[str, float]:
         judge = BucketedEPEEvaluator({int(kind): kind.name for kind in Category}, output_path=Path(folder),
                                      meta_class_lookup=names)
         for number, (points, result, truth) in enumerate(pairs):
-            known, ego_flow = known_rows(result, truth), truth.flow - truth.residual_flow(points)
+            known, ego_flow = rows_above_ground(result, truth), truth.flow - truth.residual_flow(points)
             still = PoseInfo(SE3.identity(), SE3.identity())
             cloud = SupervisedPointCloudFrame(PointCloud(np.nan_to_num(points)), still, known,
                                               truth.category.astype(np.int8))

@@ -145,10 +145,12 @@ def test_classes_of_the_truth_are_scored(lidarflow, data, run):
         file = truth_folder(data) / f"{name}.npz"
         with np.load(file) as archive:
             arrays = dict(archive)
-        np.savez(file, **arrays, category=np.where(arrays["dynamic"], 1, 0), is_ground=~arrays["dynamic"])
+        ground = ~arrays["dynamic"] & (np.arange(len(arrays["flow"])) % 2 == 0)
+        np.savez(file, **arrays, category=np.where(arrays["dynamic"], 1, 0), is_ground=ground)
     assert "bucketed error" in lidarflow.ok("eval", "run")
     found = metrics_of(run)
-    assert found["three_way"]["background_static"]["points"] == 0, "ground is left out"
+    static = sum(part["static"]["points"] for part in found["by_speed"])
+    assert found["three_way"]["background_static"]["points"] < 0.6 * static, "ground is left out"
     found = found["bucketed"]
     assert found["classes"]["BACKGROUND"]["static_m"] == pytest.approx(OFF_M, rel=1e-3)
     assert found["classes"]["CAR"]["dynamic"] < 1e-5 and found["classes"]["PEDESTRIAN"]["dynamic"] is None

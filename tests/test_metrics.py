@@ -132,6 +132,16 @@ def test_figures_say_in_their_names_what_they_are():
     assert metrics.pool([with_classes, scores]).bucketed is None, "classes of one pair are not known"
 
 
+def test_ground_has_no_part_in_the_scores_of_leaderboards():
+    points, result, truth = eight_rows()
+    by_class = np.where(truth.is_dynamic, Category.CAR, Category.BACKGROUND)
+    ground = np.arange(8) < 2     # errors of 0 and 0.2 m; 0.4 and 0.6 m are left
+    scores = metrics.score(points, result, replace(truth, category=by_class, is_ground=ground))
+    assert scores.three_way.background_static == metrics.MeanError(2, pytest.approx(0.5))
+    assert metrics.bucketed(scores.buckets).classes["BACKGROUND"].static_m == pytest.approx(0.5)
+    assert scores.all.points == 6
+
+
 def test_pose_errors_are_means_over_points():
     truth = pose.from_yaw(0.5, (1.0, 2.0, 0.0))
     motions = np.stack([truth, truth @ pose.from_yaw(0.2, (3.0, 4.0, 0.0))])

@@ -54,7 +54,10 @@ class Scores:
 
 
 def score(points: np.ndarray, result: FlowResult, truth: Truth) -> Scores:
-    """Errors of `result` for the source scan's points (N, 3), over finite rows the truth is valid for."""
+    """Errors of `result` for the source scan's points (N, 3), over finite rows the truth is valid for.
+
+    Three-way and bucketed errors leave ground out, as both leaderboards do.
+    """
     known = truth.valid & np.isfinite(result.flow).all(axis=1)
     moving, still = known & truth.is_dynamic, known & ~truth.is_dynamic
     graph = result.in_graph & result.valid
@@ -64,7 +67,7 @@ def score(points: np.ndarray, result: FlowResult, truth: Truth) -> Scores:
     rows = still & graph
     t_e, r_e = pose_errors(points[rows], result.motions[rows], truth.ego_motion)
     ego = result.ego_motion[None], truth.ego_motion[None]
-    counted = known & evaluated(points, truth.is_ground)
+    counted, above = known & evaluated(points, truth.is_ground), known & ~truth.is_ground
     return Scores(
         all=summarise(error[known]),
         static=summarise(error[still]),
@@ -77,7 +80,7 @@ def score(points: np.ndarray, result: FlowResult, truth: Truth) -> Scores:
         three_way=three_way(error[counted], residual[counted], truth.is_foreground[counted],
                             result.is_dynamic[counted]),
         buckets=None if truth.category is None else buckets(
-            points[known], error[known], residual[known], truth.category[known]),
+            points[above], error[above], residual[above], truth.category[above]),
         by_range=by_range(points[known], error[known], truth.is_dynamic[known]),
         by_speed=by_speed(residual[known], error[known], truth.is_dynamic[known]),
         dynamic_error_over_speed=error_over_speed(error[moving], residual[moving]),
