@@ -106,7 +106,7 @@ class Truth:
 
     flow        (N, 3) float   metres, total: p moves to p + flow in the target's sensor frame
     ego_motion  (4, 4) float   target_from_source
-    valid       (N,) bool      rows that are known and count in scores
+    valid       (N,) bool      rows that are known and count in scores; their flow is finite
     is_dynamic  (N,) bool      the point moves over ground
     object_id   (N,) int       id of the object the point is on, -1 = background
     category    (N,) int       a Category each; None = not known
@@ -134,9 +134,17 @@ class Truth:
                 raise ValueError(f"Truth.category: expected numbers of {', '.join(c.name for c in Category)}")
         check("Truth.is_ground", self.is_ground, (n,), "b")
         check("Truth.valid", self.valid, (n,), "b")
+        self._check_flow()
         check("Truth.is_dynamic", self.is_dynamic, (n,), "b")
         check("Truth.object_id", self.object_id, (n,), "i")
         check_motion("Truth.ego_motion", self.ego_motion)
+
+    def _check_flow(self) -> None:
+        """Raise ValueError where the flow of a valid row is not finite."""
+        unknown = np.flatnonzero(self.valid & ~np.isfinite(self.flow).all(axis=1))
+        if len(unknown):
+            raise ValueError(f"Truth.flow: not finite in {len(unknown)} valid rows, the first is row "
+                             f"{unknown[0]}; expected valid to be False there")
 
     @property
     def is_foreground(self) -> np.ndarray:

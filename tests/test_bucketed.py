@@ -70,6 +70,13 @@ def test_without_points_all_is_nan():
     assert np.isnan([found.mean.static_m, found.mean.dynamic]).all()
 
 
+def test_a_flow_whose_length_overflows_is_in_the_last_bucket():
+    points, error, residual, kind = rows(ROWS[3:4])
+    with np.errstate(over="ignore"):
+        sums = metrics.buckets(points, error, residual * 1e200, kind)
+    assert sums.points[1, -1] == 1
+
+
 def test_errors_by_range():
     points = np.array([[34.0, 0, 0], [0, 30, 40.0], [0, 0, 35.0], [60, 80, 0.0], [200, 0, 0]])
     error, moves = np.array([0.1, 0.2, 0.4, 0.8, 1.6]), np.array([True, False, False, False, True])

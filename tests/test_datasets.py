@@ -204,6 +204,13 @@ def test_kitti_raw_has_times_poses_and_truth(tmp_path, scans):
     assert "lacks track" in message(open_dataset(tmp_path).truth, 0)
     write_truth(tmp_path / "truth" / "0000000004.npz", len(POINTS), valid=np.ones(2, bool))
     assert "Truth.valid" in message(open_dataset(tmp_path).truth, 0)
+    flow = np.zeros((len(POINTS), 3))
+    flow[[1, 3], 2] = np.nan, np.inf
+    write_truth(tmp_path / "truth" / "0000000004.npz", len(POINTS), flow=flow)
+    assert ("0000000004.npz: Truth.flow: not finite in 2 valid rows, the first is row 1"
+            in message(open_dataset(tmp_path).truth, 0))
+    write_truth(tmp_path / "truth" / "0000000004.npz", len(POINTS), flow=flow, valid=np.isfinite(flow[:, 2]))
+    assert open_dataset(tmp_path).truth(0).valid.sum() == len(POINTS) - 2
 
 
 def test_kitti_raw_timestamps(tmp_path):

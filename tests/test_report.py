@@ -293,8 +293,8 @@ def test_error_maps_show_the_error_where_it_is():
     points = pair.source.points
     flow = result.flow.copy()
     flow[MOVER] += (0.0, 1.0, 0.0)
-    everywhere = np.ones(len(points), bool)
-    truth = Truth(flow, result.ego_motion, everywhere, result.is_dynamic, np.where(result.is_dynamic, 0, -1))
+    known = np.isfinite(flow).all(axis=1)
+    truth = Truth(flow, result.ego_motion, known, result.is_dynamic, np.where(result.is_dynamic, 0, -1))
     png = pictures.error_png(pair.source, result, truth)
     picture = np.asarray(Image.open(memory.BytesIO(png)).convert("RGB")).astype(int)
     wrong = np.abs(picture - pictures.ERROR_COLOURS[-1]).max(axis=2) < 8

@@ -60,7 +60,7 @@ def buckets(
     near = (np.abs(points[:, :2]) < HALF_WIDTH_M).all(axis=1) & np.isin(category, CLASSES)
     speed_m = np.linalg.norm(residual_flow[near], axis=1)
     row = np.searchsorted(CLASSES, category[near])
-    column = np.searchsorted(SPEED_EDGES_M, speed_m, side="right") - 1
+    column = np.searchsorted(SPEED_EDGES_M[1:-1], speed_m, side="right")     # of a huge flow, inf
     cells = (len(CLASSES), len(SPEED_EDGES_M) - 1)
     cell = np.ravel_multi_index((row, column), cells)
 
