@@ -11,6 +11,7 @@ from shared_data import SHARED, needs_shared
 
 from lidarflow import pose
 from lidarflow.datasets import LOADERS, guess_loader, loader_names, open_dataset
+from lidarflow.datasets.base import times_from_names
 from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.datasets.kitti_correction import correct_vertical_angle
 from lidarflow.errors import ConfigError, DataError, InstallError
@@ -32,6 +33,43 @@ def test_the_order_of_equal_numbers_and_of_digits_that_are_no_numbers_is_fixed()
     names = ["01.bin", "1.bin", "1²2.bin", "1²10.bin", "٢.bin"]
     for order in (names, names[::-1]):
         assert [file.name for file in natural_sorted(map(Path, order))] == names
+
+
+STAMPS = ["1700000000.95", "1700000001", "1700000001.05", "1700000001.1", "1700000001.15", "1700000001.2"]
+
+
+def test_names_that_are_seconds_with_trimmed_zeros_are_in_order_of_time(tmp_path):
+    for k, stamp in enumerate(STAMPS):
+        write_numpy(tmp_path / f"{stamp}.npy", POINTS + k)
+    data = open_dataset(tmp_path)
+    assert [data.scan(k).name for k in range(6)] == STAMPS
+    assert [data.scan(k).time_ns - 1_700_000_000_950_000_000 for k in range(6)] == [
+        50_000_000 * k for k in range(6)]
+
+
+@pytest.mark.parametrize("names", [
+    ["1.8", "1.9", "1.10", "1.11"],                         # counters
+    ["0.5.a", "0.05"],                                      # not all are numbers
+    ["0.05", "0.1", "0.15", "0.5"],                         # seconds, but no stamps
+    ["1.50", "2.05", "10.00"],
+    ["1.0", "1", "1.5", "2"],
+    ["0.05", "0.25", "٢.1"],
+    ["1", "2", "10"],
+])
+def test_other_names_with_points_have_one_order_and_no_times(names):
+    for order in (names, names[::-1]):
+        files = [Path(f"{name}.npy") for name in order]
+        assert [file.stem for file in natural_sorted(files)] == names
+        assert times_from_names(files) == [k * 100_000_000 for k in range(len(names))]
+
+
+def test_seconds_in_names_are_exact():
+    files = [Path(f"1700000000.{digits}.pcd") for digits in ("123456789", "123456791", "9")]
+    assert times_from_names(files) == [1_700_000_000_123_456_789, 1_700_000_000_123_456_791,
+                                       1_700_000_000_900_000_000]
+    again = times_from_names(files[::-1])
+    assert again == [0, 100_000_000, 200_000_000], "not increasing"
+    assert times_from_names([Path("99999999999.5.pcd"), Path("99999999999.6.pcd")])[0] == 0, "not 64 bits"
 
 
 @pytest.mark.parametrize("pair", [("1.bin", "1.BIN"), ("Scan1.bin", "scan1.bin")])

@@ -15,6 +15,7 @@ from lidarflow.errors import DataError
 from lidarflow.types import Scan, Truth
 
 DEFAULT_PERIOD_NS = 100_000_000
+_EARLIEST_S, _LATEST_S = 10**8, 9 * 10**9     # what a stamp may be; 64-bit nanoseconds end at 9.2e9 s
 TRUTH_ARRAYS = ("flow", "valid", "dynamic", "track", "target_from_source")
 
 
@@ -122,12 +123,24 @@ def frame_number(file: Path) -> int | None:
 
 
 def times_from_names(files: Sequence[Path]) -> list[int]:
-    """Times in ns: the file names where all are increasing nanoseconds, else 10 Hz from 0 on."""
-    if files and all(re.fullmatch(r"\d{18,19}", file.stem) for file in files):
-        times_ns = [int(file.stem) for file in files]
-        if all(a < b for a, b in itertools.pairwise(times_ns)):
-            return times_ns
+    """Times in ns: the file names where all are increasing stamps, else 10 Hz from 0 on."""
+    times_ns = _stamps(files)
+    if times_ns and all(a < b for a, b in itertools.pairwise(times_ns)):
+        return times_ns
     return [index * DEFAULT_PERIOD_NS for index in range(len(files))]
+
+
+def _stamps(files: Sequence[Path]) -> list[int]:
+    """Times in ns that files are named by, in nanoseconds or seconds with a point; none where they are not.
+
+    Seconds since 1970 have nine or ten digits; smaller ones may as well be counters.
+    """
+    if all(re.fullmatch(r"\d{18,19}", file.stem) for file in files):
+        return [int(file.stem) for file in files]
+    seconds = clouds.seconds_of_names(files)
+    if seconds is None or not all(_EARLIEST_S <= time_s < _LATEST_S for time_s in seconds):
+        return []
+    return [round(time_s.scaleb(9)) for time_s in seconds]     # binary fractions would be 100 ns off
 
 
 def rows_of_scans(row_count: int, files: Sequence[Path]) -> list[int] | None:

@@ -9,7 +9,8 @@ import re
 import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -89,13 +90,36 @@ def visible_files(folder: Path) -> list[Path]:
         raise DataError(f"{folder}: cannot be listed ({error.strerror or error})") from None
 
 
-def natural_sorted(files) -> list[Path]:
-    """Files by name, numbers in names by value: scan2 comes before scan10, of equal ones 01 before 1."""
+def natural_sorted(files: Iterable[Path]) -> list[Path]:
+    """Files by name, numbers in names by value: scan2 comes before scan10, of equal ones 01 before 1.
+
+    Where all are named by seconds (`seconds_of_names`), 5.05 comes before 5.1.
+    """
     def key(file: Path) -> tuple[list, str]:
         parts = re.split(r"(\d+)", file.name)
         return [int(part) if part.isdecimal() else part for part in parts], file.name
 
-    return sorted(files, key=key)
+    files = list(files)
+    seconds = seconds_of_names(files)
+    if seconds is None:
+        return sorted(files, key=key)
+    return [file for _, _, file in sorted(zip(seconds, (file.name for file in files), files, strict=True))]
+
+
+def seconds_of_names(files: Sequence[Path]) -> list[Decimal] | None:
+    """The seconds that files are named by, such as 1700000000.95; None unless all of them are.
+
+    Counters such as 1.9 and 1.10 are no seconds: no writer that trims zeros leaves one, and any other writes
+    all fractions with the same number of digits.
+    """
+    found = [re.fullmatch(r"[0-9]+(?:\.([0-9]+))?", file.stem) for file in files]
+    fractions = [match[1] or "" for match in found if match]
+    if len(fractions) < len(files) or not any(fractions):
+        return None
+    trimmed = all(fraction == "0" or not fraction.endswith("0") for fraction in fractions)
+    if not trimmed and len({len(fraction) for fraction in fractions}) > 1:
+        return None
+    return [Decimal(file.stem) for file in files]
 
 
 def check_names(files: Sequence[Path]) -> None:

@@ -20,9 +20,9 @@ KITTI_FOLDERS = ("velodyne", "velodyne_points/data")
 class CloudFolder(ScanFiles):
     """Every cloud file of a folder, in natural order of the names.
 
-    Times come from times.txt (seconds), from names that are nanoseconds, else 10 Hz is assumed. Poses
-    come from ego_poses.txt or derived_ego_icp.txt (frame number, 3x4) or *poses_kitti.txt (3x4), all of
-    the sensor.
+    Times come from times.txt (seconds), from names that are nanoseconds, or seconds with a point, else 10 Hz
+    is assumed. Poses come from ego_poses.txt or derived_ego_icp.txt (frame number, 3x4) or *poses_kitti.txt
+    (3x4), all of the sensor.
     """
 
     loader = "folder"
