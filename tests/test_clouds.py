@@ -41,6 +41,43 @@ def test_truncated_bin(tmp_path):
     assert "1003 bytes are not a multiple of 16" in message(read_points, file)
 
 
+@pytest.mark.parametrize("columns", [3, 5, 6])
+def test_a_bin_of_another_width_is_no_garbage(tmp_path, columns):
+    rows = np.random.default_rng(0).uniform(-50, 50, (400, columns)).astype("<f4")     # 16 bytes divide them
+    rows[:, 3:] = np.arange(columns - 3) + 7
+    rows.tofile(tmp_path / "a.bin")
+    said = message(read_points, tmp_path / "a.bin")
+    assert f"of {100 * columns} points is no reflectance (0 to 65535)" in said and "as .npy" in said
+
+
+@pytest.mark.parametrize("fourth", [0.0, 0.99, 255.0, 65535.0])
+def test_whatever_a_sensor_calls_reflectance_is_read(tmp_path, fourth):
+    rows = np.full((400, 4), fourth, "<f4")
+    rows[:, :3] = np.random.default_rng(0).uniform(-50, 50, (400, 3))
+    rows[3], rows[5, 3] = NAN, -1.0     # no return, and a damaged one
+    rows.tofile(tmp_path / "a.bin")
+    np.testing.assert_array_equal(read_points(tmp_path / "a.bin"), rows[:, :3])
+
+
+@pytest.mark.parametrize("odd", [-1.0, NAN, np.inf, 1e9])
+def test_no_sensor_has_such_reflectances(tmp_path, odd):
+    rows = np.ones((400, 4), "<f4")
+    rows[:5, 3] = odd
+    rows.tofile(tmp_path / "a.bin")
+    assert "fourth number of 5 of 400 points" in message(read_points, tmp_path / "a.bin")
+
+
+def test_files_of_nuscenes_have_five_numbers_a_point(tmp_path):
+    rows = np.column_stack([POINTS, np.full(5, 12.0), np.arange(5)]).astype("<f4")
+    rows = np.tile(rows, (4, 1))
+    rows.tofile(tmp_path / "a.pcd.bin")
+    np.testing.assert_array_equal(read_points(tmp_path / "a.pcd.bin"), np.tile(POINTS, (4, 1)))
+    rows[:, :4].tofile(tmp_path / "b.pcd.bin")
+    assert "the fifth number of" in message(read_points, tmp_path / "b.pcd.bin")
+    rows[:3, :4].tofile(tmp_path / "c.pcd.bin")
+    assert "48 bytes are not a multiple of 20" in message(read_points, tmp_path / "c.pcd.bin")
+
+
 @pytest.mark.parametrize("suffix", [".bin", ".pcd", ".ply", ".npy", ".npz", ".xyz"])
 def test_empty_file(tmp_path, suffix):
     file = tmp_path / f"a{suffix}"

@@ -20,7 +20,9 @@ from lidarflow.datasets.kitti_correction import correct_vertical_angle, is_wante
 from lidarflow.errors import DataError
 from lidarflow.types import Scan
 
-KITTI_POINT_BYTES = 16
+KITTI_POINT_BYTES, NUSCENES_POINT_BYTES = 16, 20
+_MOST_REFLECTANCE = 65535     # 0 to 1, to 255 or to 16 bits, as the sensor has it
+_ODD_SHARE = 0.01     # of reflectances, which may be damaged; of coordinates, far more are negative
 _MOST_FIELDS = 32     # more than a sensor tells of a point
 
 
@@ -175,11 +177,37 @@ def _found(folder: Path, found: Counter) -> str:
 
 
 def _read_bin(path: Path) -> np.ndarray:
+    if path.name.lower().endswith(".pcd.bin"):
+        return _read_nuscenes(path)
+    _check_size(path, KITTI_POINT_BYTES, "x y z reflectance")
+    rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
+    reflectance = rows[np.isfinite(rows[:, :3]).all(axis=1), 3]
+    odd = np.count_nonzero(~((reflectance >= 0) & (reflectance <= _MOST_REFLECTANCE)))
+    if odd > _ODD_SHARE * len(reflectance):
+        raise DataError(f"{path}: the fourth number of {odd} of {len(rows)} points is no reflectance (0 to "
+                        f"{_MOST_REFLECTANCE}); expected float32 x y z reflectance per point, "
+                        "save rows of another width as .npy")
+    return rows[:, :3]
+
+
+def _read_nuscenes(path: Path) -> np.ndarray:
+    """A .pcd.bin of nuScenes, float32 x y z intensity ring per point."""
+    _check_size(path, NUSCENES_POINT_BYTES, "x y z intensity ring")
+    rows = np.fromfile(path, dtype="<f4").reshape(-1, 5)
+    ring = rows[:, 4]
+    odd = np.count_nonzero(~((ring >= 0) & (ring % 1 == 0)))
+    if odd:
+        raise DataError(f"{path}: the fifth number of {odd} of {len(rows)} points is no ring; expected "
+                        "float32 x y z intensity ring per point, as nuScenes has it")
+    return rows[:, :3]
+
+
+def _check_size(path: Path, point_bytes: int, content: str) -> None:
+    """Raise DataError unless a file of so many bytes a point ends with a point."""
     size = path.stat().st_size
-    if size % KITTI_POINT_BYTES:
-        raise DataError(f"{path}: {size} bytes are not a multiple of {KITTI_POINT_BYTES} (float32 x y z "
-                        "reflectance per point); the file is truncated or of another format")
-    return np.fromfile(path, dtype="<f4").reshape(-1, 4)[:, :3]
+    if size % point_bytes:
+        raise DataError(f"{path}: {size} bytes are not a multiple of {point_bytes} (float32 {content} per "
+                        "point); the file is truncated or of another format")
 
 
 def _read_npy(path: Path) -> np.ndarray:
