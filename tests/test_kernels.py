@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 from lidarflow.kernels import (
+    cells,
     coherence,
     graphs,
     grid,
@@ -532,16 +533,32 @@ def test_normals():
     check_normals(1500)
 
 
-def test_a_narrow_piece_has_no_normal_that_faces_the_sensor():
+def test_narrow_pieces_are_told_from_others():
     along = np.linspace(0.0, 1.4, 60)
-    noise = rng(7).normal(0.0, 1.0, (60, 2))
-    steep, flat = (np.column_stack([along, noise * spread]) + [0.0, 20.0, -1.7]
-                   for spread in ([0.005, 0.02], [0.02, 0.005]))
-    assert np.isfinite(normals.estimate(np.concatenate([steep, flat]), steep, 0.7)).all()
-    assert np.isnan(normals.estimate(steep, steep, 0.7, min_width_m=0.05)).all()
-    assert np.isfinite(normals.estimate(flat, flat, 0.7, min_width_m=0.05)).mean() > 0.8
-    wall = np.concatenate([steep, steep + [0.0, 0.0, 0.4]])
-    assert (np.abs(normals.estimate(wall, wall, 0.7, min_width_m=0.05)[:, 1]) > 0.9).all()
+    piece = np.column_stack([along, rng(7).normal(0.0, (0.005, 0.02), (60, 2))]) + [0.0, 20.0, -1.7]
+    wall = np.concatenate([piece, piece + [0.0, 0.0, 0.4]]) + [5.0, 0.0, 0.0]
+    points = np.concatenate([piece, wall])
+    near = cells.build(points, 0.7)
+    found, is_narrow = normals.estimated(points, near, points, near, 0.05)
+    np.testing.assert_array_equal(is_narrow, np.arange(len(points)) < len(piece))
+    np.testing.assert_array_equal(found, normals.estimate(points, points, 0.7))
+    assert not normals.estimated(points, near, points, near, 0.0)[1].any()
+
+
+def test_narrow_pieces_have_the_normal_of_the_ground_where_they_are_level_and_else_none():
+    ground = np.array([[0.1, 0.0, 1.0], [-0.3, 0.0, 1.0], [0.0, 0.2, -1.0]])
+    ground /= np.linalg.norm(ground, axis=1, keepdims=True)
+    up = (ground[0] + ground[1] - ground[2]) / np.linalg.norm(ground[0] + ground[1] - ground[2])
+    leaning, ceiling = np.array([0.0, 0.6, 0.8]), np.array([0.0, 0.6, -0.8])
+    wall, unknown = np.array([1.0, 0.0, 0.0]), np.full(3, np.nan)
+    given = np.vstack([ground, wall, unknown, leaning, ceiling, wall])
+    is_narrow = np.arange(len(given)) >= 5
+    found = given.copy()
+    normals.level(found, is_narrow)
+    np.testing.assert_allclose(found, np.vstack([given[:5], up, -up, unknown]), atol=1e-12)
+    alone = given[5:].copy()
+    normals.level(alone, np.ones(3, bool))
+    assert np.isnan(alone).all(), "no ground tells which way is up"
 
 
 def test_normals_without_any_surface_are_nan():

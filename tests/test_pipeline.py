@@ -216,6 +216,16 @@ def test_rounded_rings_on_an_open_road_are_no_surfaces_that_travel_with_the_sens
     assert_same_motion(found, truth.ego_motion, 0.03, 0.1)
 
 
+@pytest.mark.parametrize("seed", [4, 6, 7])
+def test_the_sensor_does_not_seem_to_rest_where_little_but_a_road_and_a_car_beside_it_is_seen(seed):
+    scans = synthetic.scan_sequence(synthetic.one_car(4.0, rng(seed)), synthetic.hdl32e(), 4, rng(0))
+    thinned, last = [ego.Thinned.of_scan(scan, Config()) for scan, _ in scans], None
+    for source, target, (_, truth) in zip(thinned, thinned[1:], scans, strict=False):
+        last = ego.find(source, target, last, Config().ego)
+        assert_same_motion(last, truth.ego_motion, 0.05, 0.1)
+        assert_same_motion(ego.register(source, target), truth.ego_motion, 0.05, 0.1)
+
+
 def test_identical_scans_do_not_flow():
     pair, _ = pair_of(synthetic.one_car(8.0, rng(1)), COARSE, 2)
     same = ScanPair(pair.source, Scan(pair.source.points.copy(), 100_000_000, "again"))

@@ -32,7 +32,10 @@ def in_range(points, min_range_m, max_range_m):
 
 
 def planes(points: np.ndarray, normal_radius_m: float, min_width_m: float) -> tuple[Tree, np.ndarray]:
-    """The tree over points (N, 3), and a normal (N, 3) at each in its order, as normals.estimate."""
+    """The tree over points (N, 3), and a normal (N, 3) at each in its order.
+
+    As normals.estimate, and as normals.level where a neighbourhood is narrower than `min_width_m`.
+    """
     _launch_threads()
     return _planes(np.ascontiguousarray(points), float(normal_radius_m), float(min_width_m))
 
@@ -61,7 +64,9 @@ def _launch_threads() -> None:
 def _planes(points, normal_radius_m, min_width_m):
     grown = trees.grown(points)
     near = cells.built(grown.points, normal_radius_m)
-    return grown, normals.estimated(grown.points, near, grown.points, near, min_width_m)
+    found, is_narrow = normals.estimated(grown.points, near, grown.points, near, min_width_m)
+    normals.level(found, is_narrow)
+    return grown, found
 
 
 @njit()

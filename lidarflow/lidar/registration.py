@@ -15,9 +15,10 @@ from lidarflow.open3d_import import open3d
 
 _SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range: indoors all is smaller
 _NORMAL_RADIUS_VOXELS = 3.5
-# A piece of one ring on the road is as wide as ranges are noisy, and its normal points anywhere across it:
-# those that face the sensor make planes that travel with it. What is narrower than this, as a standard
-# deviation, has none but those that lie across the line of sight, as the road's does.
+# A piece of one ring on the road is as wide as ranges are noisy: along the line of sight, or anywhere across
+# where coordinates are rounded. Planes fitted to such pieces lean or stand all around the sensor, travel with
+# it, and say that it rests. What is narrower than this, as a standard deviation, has the normal of the
+# ground where it is level, and none where it is not.
 _MIN_WIDTH_VOXELS = 0.2
 _MIN_POINTS = 30
 _SETTLED = 1e-5              # a step that stays below it, in metres and radians, ends a registration
