@@ -78,12 +78,13 @@ def rows34(motion: np.ndarray) -> np.ndarray:
 
 # ---- images ---------------------------------------------------------------------------------------------
 
-def surface_mean(readings: np.ndarray) -> float:
-    readings = np.sort(readings[readings > 0])
+def surface_mean(readings: np.ndarray, shares: np.ndarray) -> float:
+    known = readings > 0
+    readings, shares = readings[known], shares[known]
     if not len(readings):
         return 0.0
-    near = np.abs(readings - readings[(len(readings) - 1) // 2]) < JUMP_M
-    return readings[near].mean(dtype=float)
+    near = np.abs(readings - np.sort(readings)[(len(readings) - 1) // 2]) < JUMP_M
+    return np.average(readings[near].astype(float), weights=shares[near])
 
 
 def check_resize(height: int, width: int, small_height: int, small_width: int) -> None:
@@ -96,7 +97,9 @@ def check_resize(height: int, width: int, small_height: int, small_width: int) -
             share = np.outer(*(np.diff(edge) for edge in edges))
             expected = (share * intensity).sum() / share.sum()
             np.testing.assert_allclose(small_intensity[v, u], expected, atol=1e-5)
-            np.testing.assert_allclose(small_depth[v, u], surface_mean(depth[share > 1e-6]), rtol=1e-5)
+            under = share > 1e-6
+            np.testing.assert_allclose(
+                small_depth[v, u], surface_mean(depth[under], share[under]), rtol=1e-5)
 
 
 def check_halve(height: int, width: int) -> None:

@@ -73,6 +73,19 @@ def test_depth_is_never_a_mixture_of_two_surfaces():
         assert set(np.unique(level.packed[..., 1].round(4))) == {1.0, 3.0}
 
 
+@pytest.mark.parametrize("size", [(640, 480), (400, 300), (333, 241), (848, 480)])
+def test_a_slanted_plane_keeps_its_depth_at_any_size(size):
+    def depth_of(camera: Camera) -> np.ndarray:
+        slant = (np.arange(camera.width) - camera.cx) / camera.fx
+        return np.tile(3.0 / (1.0 - 0.8 * slant), (camera.height, 1)).astype(np.float32)
+
+    camera = Camera.from_field_of_view(*size)
+    found, smaller = pyramid.at_working_size(
+        RgbdFrame(np.full((camera.height, camera.width), 0.5, np.float32), depth_of(camera)), camera,
+        DEFAULTS.images)
+    np.testing.assert_allclose(found.depth, depth_of(smaller), atol=0.0025)
+
+
 def test_a_frame_that_says_nothing_is_refused():
     blank = RgbdFrame(np.ones((240, 320), np.float32), np.zeros((240, 320), np.float32), name="dark")
     with pytest.raises(DataError, match="dark: no pixel has a depth"):

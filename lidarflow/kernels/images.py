@@ -19,7 +19,7 @@ _DEPTH_GRAIN_M = 0.005
 def resize(intensity, depth, width, height, max_jump_m):
     """Area mean of intensity and a surface's mean depth, both (height, width), of larger images (H, W).
 
-    A pixel's depth is the mean of the readings in its area that lie within `max_jump_m` of their median.
+    A pixel's depth is the area mean of the readings under it that lie within `max_jump_m` of their median.
     """
     rows, columns = depth.shape
     scale_v, scale_u = rows / height, columns / width
@@ -27,7 +27,8 @@ def resize(intensity, depth, width, height, max_jump_m):
     small_depth = np.zeros((height, width), np.float32)
     most = (math.ceil(scale_v) + 1) * (math.ceil(scale_u) + 1)
     for v in numba.prange(height):
-        readings = np.empty(most, np.float32)
+        readings, in_order = np.empty(most, np.float32), np.empty(most, np.float32)
+        shares = np.empty(most)
         top, bottom = v * scale_v, (v + 1) * scale_v
         for u in range(width):
             left, right = u * scale_u, (u + 1) * scale_u
@@ -39,26 +40,30 @@ def resize(intensity, depth, width, height, max_jump_m):
                     total += share * intensity[j, i]
                     area += share
                     if depth[j, i] > 0.0:
-                        readings[count] = depth[j, i]
+                        readings[count], shares[count] = depth[j, i], share
                         count += 1
             small_intensity[v, u] = total / area
-            small_depth[v, u] = _surface_depth(readings, count, max_jump_m)
+            small_depth[v, u] = _surface_depth(readings, shares, count, max_jump_m, in_order)
     return small_intensity, small_depth
 
 
 @njit()
-def _surface_depth(readings, count, max_jump_m):
-    """Mean of the first `count` readings near their lower median; 0 without any. Sorts them in place."""
+def _surface_depth(readings, shares, count, max_jump_m, in_order):
+    """Mean, weighted by `shares`, of the first `count` readings near their lower median; 0 without any.
+
+    `in_order` is room for as many.
+    """
     if count == 0:
         return 0.0
-    _sort(readings, count)
-    middle = readings[(count - 1) // 2]
-    total, near = 0.0, 0
+    in_order[:count] = readings[:count]
+    _sort(in_order, count)
+    middle = in_order[(count - 1) // 2]
+    total = weight = 0.0
     for k in range(count):
         if abs(readings[k] - middle) < max_jump_m:
-            total += readings[k]
-            near += 1
-    return total / near
+            total += shares[k] * readings[k]
+            weight += shares[k]
+    return total / weight
 
 
 @njit()
