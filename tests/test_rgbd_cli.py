@@ -244,6 +244,7 @@ def test_the_demo_runs_twice_into_one_folder(lidarflow, tmp_path, monkeypatch):
 def test_pairs_that_cannot_be_used(lidarflow, images, tmp_path):
     color0, depth0, color1, depth1 = images
     zero = save(tmp_path / "zero.png", np.zeros((240, 320), np.uint16))
+    speck = save(tmp_path / "speck.png", np.pad(np.full((1, 1), 5000, np.uint16), ((120, 119), (160, 159))))
     shallow = save(tmp_path / "shallow.png", np.full((240, 320), 9, np.uint8))
     small = save(tmp_path / "small.png", np.full((120, 160), 5000, np.uint16))
     small_color = save(tmp_path / "small_color.png", np.full((120, 160, 3), 90, np.uint8))
@@ -253,6 +254,7 @@ def test_pairs_that_cannot_be_used(lidarflow, images, tmp_path):
     for words, found in (
         ((color0, zero, color1, depth1), "zero.png: no pixel has depth"),
         ((color0, depth0, color1, zero), "zero.png: no pixel has depth"),
+        ((color0, depth0, color1, speck), "odometry: 0% of the first frame's depth is seen again"),
         ((color0, shallow, color1, depth1), "shallow.png: an 8-bit image"),
         ((depth0, color0, depth1, color1), "depth0.png: a 16-bit image of one channel"),
         ((color0, color1, depth0, depth1), "color1.png: an 8-bit image of mode RGB; expected 16-bit depth"),

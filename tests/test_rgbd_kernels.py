@@ -253,6 +253,21 @@ def check_misfits(height: int, width: int) -> None:
 
 # ---- alignment ------------------------------------------------------------------------------------------
 
+def check_seen_again(height: int, width: int) -> None:
+    world = World(height, width)
+    world.points[:, :width // 4, 2] *= -1.0     # no depth, whatever x and y
+    x, y, z = pose.apply(world.motion, world.points[world.points[..., 2] > 0].astype(float)).T
+    u = np.floor(world.camera[0] * x / z + world.camera[2] + 0.5).astype(int)
+    v = np.floor(world.camera[1] * y / z + world.camera[3] + 0.5).astype(int)
+    padded = np.pad(world.target[..., 1], 1)
+    expected = padded[np.clip(v + 1, 0, height + 1), np.clip(u + 1, 0, width + 1)] > 0
+    assert 0.5 < expected.mean() < 0.99
+    found = alignment.seen_again(world.points, world.target, world.camera, rows34(world.motion))
+    np.testing.assert_allclose(found, expected.mean(), atol=1.5 / len(expected))
+    behind = pose.from_translation(np.array([0.0, 0.0, -9.0]))
+    assert alignment.seen_again(world.points, world.target, world.camera, rows34(behind)) == 0.0
+
+
 def unpacked(system: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Equations (2, 7, P) of a system."""
     return np.concatenate([chunk[:, :, :count] for chunk, count in zip(system, counts, strict=True)], axis=-1)
@@ -360,7 +375,7 @@ def check_all_tiny() -> None:
     check_kmeans(60)
     check_solve_positive6(2)
     for check in (check_touching, check_membership_and_blending, check_cluster_residuals, check_misfits,
-                  check_linearise, check_solve, check_solve_each):
+                  check_seen_again, check_linearise, check_solve, check_solve_each):
         check(12, 16)
 
 
@@ -396,6 +411,10 @@ def test_cluster_residuals():
 
 def test_misfits():
     check_misfits(60, 80)
+
+
+def test_seen_again():
+    check_seen_again(60, 80)
 
 
 def test_linearise():

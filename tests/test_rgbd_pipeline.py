@@ -153,6 +153,45 @@ def test_an_estimator_carries_the_segmentation_and_forgets_after_a_frame_it_cann
     assert equal(estimator.step(sequence[2]), alone)
 
 
+LEFT, RIGHT, PIXEL = np.arange(320) < 160, np.arange(320) >= 160, np.arange(240 * 320) == 120 * 320 + 160
+
+
+def with_depth(frame: RgbdFrame, where: np.ndarray) -> RgbdFrame:
+    """The frame with depth at some of its pixels only, (240, 320) bool or what broadcasts to that."""
+    return RgbdFrame(frame.intensity, np.where(where, frame.depth, np.float32(0.0)), name=frame.name)
+
+
+@pytest.mark.parametrize(("source", "target"), [
+    pytest.param(LEFT, RIGHT, id="one half and the other"),
+    pytest.param(True, PIXEL.reshape(240, 320), id="one pixel"),
+])
+@pytest.mark.parametrize("settings", [DEFAULTS, PLAIN], ids=["default", "plain"])
+def test_frames_that_show_nothing_in_common_are_refused(source, target, settings):
+    pair = corner_pair()
+    cut = RgbdPair(with_depth(pair.source, source), with_depth(pair.target, target), QVGA)
+    with pytest.raises(DataError, match="odometry: 0% of the first frame's depth is seen again"):
+        estimate_flow(cut, settings)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.2])
+def test_frames_with_depth_for_a_part_of_each_other_are_enough(share):
+    pair = corner_pair()
+    target = with_depth(pair.target, np.arange(320) >= 320 * (1.0 - share))
+    result = estimate_flow(RgbdPair(pair.source, target, QVGA))
+    assert pose.translation_distance(MOTION, result.odometry) < 0.002
+
+
+def test_an_estimator_goes_on_after_frames_that_show_nothing_in_common():
+    first, second, third = (frame for frame, _ in frames("living_room")[:3])
+    estimator = RgbdEstimator(QVGA)
+    estimator.step(with_depth(first, LEFT))
+    with pytest.raises(DataError, match="seen again"):
+        estimator.step(with_depth(second, RIGHT))
+    estimator.reset()
+    assert estimator.step(second) is None
+    assert equal(estimator.step(third), estimate_flow(RgbdPair(second, third, QVGA)))
+
+
 @pytest.mark.parametrize("depth", [
     pytest.param(np.eye(240, 320, dtype=np.float32), id="hardly any depth"),
     pytest.param(np.full((240, 320), 2.0, np.float32), id="nothing to see on a wall"),

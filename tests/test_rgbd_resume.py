@@ -6,6 +6,7 @@ import os
 import numpy as np
 import pytest
 from killed import contents, program, was_killed
+from PIL import Image
 from rgbd_worlds import QVGA, frames
 
 from lidarflow import io, pose, rgbd_io, rgbd_methods, rgbd_metrics, synthetic
@@ -240,6 +241,17 @@ def test_a_damaged_frame_is_skipped_and_counted(room, tmp_path, lidarflow, resum
                      for place in (out, tmp_path / "fresh"))
     np.testing.assert_array_equal(behind.flow, fresh.flow)
     np.testing.assert_array_equal(behind.b, fresh.b)
+
+
+def test_a_frame_that_shows_nothing_of_the_one_before_is_skipped(room, tmp_path, lidarflow):
+    data, out = copy_of(room, tmp_path / "data"), tmp_path / "run"
+    speck = np.pad(np.full((1, 1), 5000, np.uint16), ((120, 119), (160, 159)))
+    Image.fromarray(speck).save(data / "depth" / f"{NAMES[2]}.png")
+    said = lidarflow.complaint("rgbd", "run", data, "--out", out, "--no-record")
+    assert "seen again" in said and "(frames 1 and 2 of" in said and "flow of 1 before is kept" in said
+    told = lidarflow.ok("rgbd", "run", data, "--out", out, "--no-record", "--resume", "--skip-bad")
+    assert "skipped    frame 2: odometry: 0%" in told and "2 pairs are left" in told
+    assert sorted(os.listdir(out / "flow")) == [f"{NAMES[0]}.npz", f"{NAMES[3]}.npz"]
 
 
 def test_nothing_but_damaged_frames(room, tmp_path, lidarflow):

@@ -57,6 +57,25 @@ def look_up(target, camera, x, y, z, max_jump_m, layers, seen):
 
 
 @njit(error_model="numpy")
+def seen_again(points, target, camera, motion):
+    """Share of the points with depth that, moved, a packed image has depth for, in the nearest pixel."""
+    rows, columns = target.shape[0], target.shape[1]
+    known, seen = 0, 0
+    half = np.float32(0.5)
+    for point in points.reshape(-1, 3):
+        if point[2] <= 0.0:
+            continue
+        known += 1
+        x, y, z = moved(point, motion)
+        if z <= NEAREST_M:
+            continue
+        u, v = camera[0] * x / z + camera[2] + half, camera[1] * y / z + camera[3] + half
+        if u >= 0.0 and v >= 0.0 and u < columns and v < rows and target[int(v), int(u), 1] > 0.0:
+            seen += 1
+    return seen / known
+
+
+@njit(error_model="numpy")
 def _fill(points, source, target, camera, motion, pixels, weights, noise, weighting, max_jump_m, equations,
           largest):
     """Write the equations (2, 7, CHUNK) of some pixels, weighted, and return for how many there are any.

@@ -14,8 +14,9 @@ from lidarflow.stopwatch import Stopwatch
 def estimate_flow(
     pair: RgbdPair, config: RgbdConfig | None = None, previous: RgbdResult | None = None
 ) -> RgbdResult:
-    """Odometry, segmentation and scene flow of a pair; raises DataError for frames without depth.
+    """Odometry, segmentation and scene flow of a pair.
 
+    Raises DataError for frames without depth, or with too little of it in common.
     `previous` is the result of the pair that ended with this pair's source, if there is one.
     """
     check_is("pair", pair, RgbdPair)
@@ -84,6 +85,7 @@ def _estimate(
                 b = segmentation.segment(source[0], target[0], clusters, static, b_before, config)
             if (segmentation.has_own_motion(b, config.segmentation) == had_own_motion).all():
                 break
+    odometry.require_overlap(source[0], target[0], static)
     with timed("scene flow"):
         label = clusters.labels[0]
         flow = cluster_images.blended_flow(
