@@ -145,7 +145,7 @@ def test_robust_and_refined_odometry_find_an_exact_motion(scale):
     clusters = geometric.find(source, DEFAULTS.clusters)
     nothing_moves = np.zeros(len(clusters.centres))
     robust = odometry.robust(source, target, clusters, nothing_moves, DEFAULTS)
-    refined, motions = refinement.refine(source, target, clusters, nothing_moves, DEFAULTS)
+    refined, motions = refinement.refine(source, target, clusters, nothing_moves, robust, DEFAULTS)
     for found in (robust, refined):
         assert pose.translation_distance(motion, found) < 0.001
         assert np.degrees(pose.rotation_distance(motion[None], found[None])[0]) < 0.03
@@ -164,9 +164,18 @@ def test_clusters_known_to_move_do_not_disturb_the_odometry():
     told = odometry.robust(source, mixed, clusters, far.astype(float), DEFAULTS)
     untold = odometry.robust(source, mixed, clusters, np.zeros(len(far)), DEFAULTS)
     assert pose.translation_distance(MOTION, told) < 0.002 < 0.01 < pose.translation_distance(MOTION, untold)
-    refined, motions = refinement.refine(source, mixed, clusters, far.astype(float), DEFAULTS)
+    refined, motions = refinement.refine(source, mixed, clusters, far.astype(float), told, DEFAULTS)
     assert pose.translation_distance(MOTION, refined) < 0.002
     assert np.median(pose.translation_distance(motions[far], np.eye(4))) < 0.002
+
+
+def test_where_everything_moves_the_robust_odometry_stays():
+    source, target = pair_levels(MOTION)
+    clusters = geometric.find(source, DEFAULTS.clusters)
+    everything_moves = np.full(len(clusters.centres), 2.0)
+    refined, motions = refinement.refine(source, target, clusters, everything_moves, MOTION, DEFAULTS)
+    np.testing.assert_array_equal(refined, MOTION)
+    assert np.median(pose.translation_distance(motions, MOTION)) < 0.002
 
 
 # ---- segmentation ---------------------------------------------------------------------------------------

@@ -71,7 +71,7 @@ def _estimate(
         b_before = None if previous is None else propagation.carried(previous, source[0], clusters)
     nothing_moves = np.zeros(len(clusters.centres))
     with timed("robust odometry"):
-        static = odometry.robust(
+        static = robust = odometry.robust(
             source, target, clusters, nothing_moves if b_before is None else b_before, config)
     b, motions = nothing_moves, np.tile(static, (len(nothing_moves), 1, 1))
     if config.segmentation.enabled:
@@ -80,7 +80,7 @@ def _estimate(
         for _ in range(config.refinement.max_rounds):
             had_own_motion = segmentation.has_own_motion(b, config.segmentation)
             with timed("refinement"):
-                static, motions = refinement.refine(source, target, clusters, b, config)
+                static, motions = refinement.refine(source, target, clusters, b, robust, config)
             with timed("segmentation"):
                 b = segmentation.segment(source[0], target[0], clusters, static, b_before, config)
             if (segmentation.has_own_motion(b, config.segmentation) == had_own_motion).all():

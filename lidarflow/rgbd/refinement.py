@@ -13,19 +13,21 @@ from lidarflow.rgbd_config import RgbdConfig
 
 def refine(
     source: tuple[Level, ...], target: tuple[Level, ...], clusters: Clusters, b: np.ndarray,
-    config: RgbdConfig,
+    robust: np.ndarray, config: RgbdConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
     """ξ_O as target_from_source (4, 4) and the motions (K, 4, 4) of the clusters, coarse to fine.
 
     Clusters with b below `static_below` have the odometry's motion; those above `moving_above` do not help to
-    find it; those between do both. The coarsest level knows the odometry alone.
+    find it; those between do both. The coarsest level knows the odometry alone. Where no cluster helps, the
+    odometry stays the `robust` one (4, 4).
     """
     limits = config.segmentation
     own_motion, helps_odometry = has_own_motion(b, limits), b <= limits.moving_above
     static = np.clip(1.0 - b, 0.0, 1.0) ** config.refinement.doubt_power * helps_odometry
     static = np.append(static, 0.0).astype(np.float32)
     coarsest = len(source) - 1
-    odometry, motions = np.eye(4), np.tile(np.eye(4), (len(b), 1, 1))
+    odometry = np.eye(4) if static.any() else robust
+    motions = np.tile(odometry, (len(b), 1, 1))
     for level in reversed(range(len(source))):
         label = clusters.labels[level]
         images = source[level], target[level]
