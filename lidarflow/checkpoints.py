@@ -17,6 +17,7 @@ import numpy as np
 
 from lidarflow import io, pose
 from lidarflow.checks import check
+from lidarflow.datasets.arrays import ERRORS, MissingArray, from_npz
 from lidarflow.errors import DataError
 from lidarflow.lidar.tracking import Track, Tracks
 from lidarflow.types import FlowResult, MovingObject, Scan, ScanPair, SolveStats
@@ -26,8 +27,8 @@ _PLAIN = ("valid", "in_graph", "is_dynamic", "ego_motion", "match_source", "matc
 _OF_OBJECTS = {"motion": (4, 4), "velocity": (3,), "box_centre": (3,), "box_size": (3,), "box_yaw": (),
                "points": ()}
 _NAMES = ("digest", *_PLAIN, "flow", "motion_table", "motion_row", "object_ids",
-          *(f"object_{name}" for name in _OF_OBJECTS), "track_ids", "track_missed", "track_over_ground",
-          "track_counts", "track_points", "notes")
+          *(f"object_{name}" for name in _OF_OBJECTS), "track_ids", "track_missed", "track_took_s",
+          "track_over_ground", "track_counts", "track_points", "notes")
 
 
 class CheckpointFiles:
@@ -79,6 +80,7 @@ def packed(pair: ScanPair, result: FlowResult, tracks: Tracks) -> bytes:
         "object_ids": np.array([found.id for found in result.objects], np.int64),
         "track_ids": np.array([track.id for track in tracks.followed], np.int64),
         "track_missed": np.array([track.missed for track in tracks.followed], np.int64),
+        "track_took_s": np.array([track.took_s for track in tracks.followed], float),
         "track_over_ground": np.array([track.over_ground for track in tracks.followed]).reshape(-1, 4, 4),
         "track_counts": np.array([len(track.points) for track in tracks.followed], np.int64),
         "track_points": np.concatenate([np.empty((0, 3)), *(track.points for track in tracks.followed)]),
@@ -111,11 +113,21 @@ def read_bound(
     file: Path, names: tuple[str, ...], digest: str, pair: tuple[str, str],
 ) -> dict[str, np.ndarray]:
     """The arrays of a checkpoint; DataError where it is damaged, or made of a pair with another digest."""
-    arrays = io.read_archive(file, names)
+    arrays = read_arrays(file, names)
     if str(arrays["digest"]) != digest:
         raise DataError(f"{file}: was made of other data than {pair[0]} and {pair[1]} are now; the data "
                         "changed, run again without --resume")
     return arrays
+
+
+def read_arrays(file: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Arrays of a checkpoint by their `names`; DataError where it is damaged, or of another layout."""
+    try:
+        with naming_damage(file):
+            return from_npz(file, names)
+    except MissingArray as error:
+        raise DataError(f"{file}: {error}, as checkpoints of another version do; run again without --resume "
+                        "to begin anew") from None
 
 
 @contextlib.contextmanager
@@ -123,7 +135,7 @@ def naming_damage(file: Path) -> Iterator[None]:
     """DataError, which names the checkpoint, for what arrays that make no sense raise."""
     try:
         yield
-    except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as error:
+    except (*ERRORS, IndexError) as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{file}: damaged ({reason}); delete it and resume again") from None
 
@@ -154,19 +166,19 @@ class Numbers:
 
 def numbers_of(file: Path) -> np.ndarray:
     """The number (N,) of the moving object that each point of a checkpoint is on, -1 = none."""
-    return io.read_archive(file, ("object_id",))["object_id"]
+    return read_arrays(file, ("object_id",))["object_id"]
 
 
 def renumbered(file: Path, numbers: Numbers) -> dict[str, np.ndarray]:
     """What is in a checkpoint, with other numbers of objects; tracks without one are let go."""
-    arrays = io.read_archive(file, _NAMES)
+    arrays = read_arrays(file, _NAMES)
     arrays["object_ids"] = np.array([numbers.of(old) for old in arrays["object_ids"].tolist()], np.int64)
     old, row = np.unique(arrays["object_id"], return_inverse=True)
     new = [numbers.of(number) if number >= 0 else -1 for number in old.tolist()]
     arrays["object_id"] = np.array(new, np.int32)[row.reshape(-1)]
     is_known = np.isin(arrays["track_ids"], list(numbers.known))
     arrays["track_points"] = arrays["track_points"][np.repeat(is_known, arrays["track_counts"])]
-    for name in ("track_ids", "track_missed", "track_over_ground", "track_counts"):
+    for name in ("track_ids", "track_missed", "track_took_s", "track_over_ground", "track_counts"):
         arrays[name] = arrays[name][is_known]
     arrays["track_ids"] = np.array([numbers.of(old) for old in arrays["track_ids"].tolist()], np.int64)
     notes = json.loads(str(arrays["notes"]))
@@ -202,7 +214,7 @@ def _objects(arrays: dict[str, np.ndarray]) -> tuple[MovingObject, ...]:
 def _tracks(arrays: dict[str, np.ndarray]) -> tuple[Track, ...]:
     clouds = np.split(arrays["track_points"], np.cumsum(arrays["track_counts"])[:-1])
     return tuple(
-        Track(int(number), points, over_ground, int(missed))
-        for number, points, over_ground, missed in zip(
+        Track(int(number), points, over_ground, float(took_s), int(missed))
+        for number, points, over_ground, took_s, missed in zip(
             arrays["track_ids"], clouds[:len(arrays["track_ids"])], arrays["track_over_ground"],
-            arrays["track_missed"], strict=True))
+            arrays["track_took_s"], arrays["track_missed"], strict=True))

@@ -210,7 +210,7 @@ def prepare(
         with timed("features"):
             target.begun_cloud.result()
         with timed("evidence"):
-            search = attribution.search(source, target, ego_motion, tracks, config)
+            search = attribution.search(source, target, ego_motion, tracks, pair.dt_s, config)
     with timed("features"):
         keypoints = source.keypoints, target.keypoints
     with timed("mesh"):

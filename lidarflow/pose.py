@@ -134,6 +134,12 @@ def interpolate(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     return start @ exp(share * log(inverse(start) @ end))
 
 
+def lasting(motion: np.ndarray, took: float, dt: float) -> np.ndarray:
+    """Motions (..., 4, 4) that took as long as `took`, gone on with for `dt` in the same unit."""
+    # Equal times must not let rounding in.
+    return motion if took == dt else interpolate(np.eye(4), motion, dt / took)
+
+
 def trajectory(steps: np.ndarray) -> np.ndarray:
     """Poses (N + 1, 4, 4), first_from_each, of a sensor whose `steps` (N, 4, 4) are target_from_source."""
     poses = [np.eye(4)]

@@ -67,7 +67,7 @@ def some_pair():
         pose.apply(motions, points) - points, motions, *(rng.random((3, 40)) < 0.5), motions[0], STATS,
         {"solver": 0.1}, points[:4], points[4:8], objects=(found,),
         object_id=np.arange(-1, 39, dtype=np.int32))
-    tracks = Tracks((Track(3, points[:9], motions[0], 1),), 4)
+    tracks = Tracks((Track(3, points[:9], motions[0], 0.1, 1),), 4)
     return ScanPair(Scan(points, 0, "0"), Scan(points + 1, 10**8, "1")), result, tracks
 
 

@@ -219,7 +219,7 @@ def test_a_checkpoint_comes_back_to_the_last_bit(street, tmp_path):
             for found, made in zip(tracks.followed, step.tracks.followed, strict=True):
                 np.testing.assert_array_equal(found.points, made.points)
                 np.testing.assert_array_equal(found.over_ground, made.over_ground)
-                assert (found.id, found.missed) == (made.id, made.missed)
+                assert (found.id, found.took_s, found.missed) == (made.id, made.took_s, made.missed)
 
 
 def test_a_damaged_checkpoint_is_named(street, tmp_path):
@@ -229,6 +229,18 @@ def test_a_damaged_checkpoint_is_named(street, tmp_path):
     file, = kept.folder.iterdir()
     file.write_bytes(file.read_bytes()[:-30])
     assert str(file) in message(kept.load, 0, step.pair)
+
+
+def test_a_checkpoint_of_another_layout_is_refused_in_one_line(street, tmp_path, lidarflow):
+    out = tmp_path / "run"
+    assert was_killed(program(("run", street, "--out", out), "lidarflow.checkpoints.packed", 3))
+    file = Checkpoints(out).file(1)
+    with np.load(file) as archive:
+        arrays = dict(archive)
+    del arrays["track_took_s"]
+    file.write_bytes(io.archive(arrays))
+    said = lidarflow.complaint("run", street, "--out", out, "--resume", "--skip-bad")
+    assert f"{file}: lacks track_took_s" in said and "without --resume" in said
 
 
 # Damaged scans.

@@ -73,11 +73,11 @@ class Search:
 
 
 def search(
-    source: Features, target: Features, ego_motion: np.ndarray, tracks: Tracks, config: Config
+    source: Features, target: Features, ego_motion: np.ndarray, tracks: Tracks, dt_s: float, config: Config
 ) -> Search:
-    """What the scans alone tell of moving objects; `tracks` are of the pair before, in the source's frame."""
+    """What two scans, `dt_s` apart, tell of moving objects; `tracks` are of the pair before, source frame."""
     view = view_of_pair.look(source.cloud.moved(ego_motion), target.cloud, config.objects)
-    expected = _expected(tracks, ego_motion)
+    expected = _expected(tracks, ego_motion, dt_s)
     found = seeds.find(view, expected.points, config.objects)
     rows = np.flatnonzero(source.standing)
     return Search(rows, view, expected, found)
@@ -115,13 +115,13 @@ def attribute(
         for number, cloud, motion in zip(ids, clouds, motions, strict=True))
     return Attribution(
         owner, np.array(motions).reshape(-1, 4, 4), np.array(ids, np.int32), explained, std_m,
-        described, tracking.advance(tracks, ids, clouds, over_ground, ego_motion))
+        described, tracking.advance(tracks, ids, clouds, over_ground, ego_motion, pair.dt_s))
 
 
-def _expected(tracks: Tracks, ego_motion: np.ndarray) -> Expected:
-    """What the tracks lead to expect, in the frame of the view: that of the target."""
+def _expected(tracks: Tracks, ego_motion: np.ndarray, dt_s: float) -> Expected:
+    """What the tracks lead to expect `dt_s` later, in the frame of the view: that of the target."""
     clouds = [pose.apply(ego_motion, track.points) for track in tracks.followed]
-    shifts = [(pose.apply(track.goes_on(ego_motion), points) - points).mean(axis=0)
+    shifts = [(pose.apply(track.goes_on(ego_motion, dt_s), points) - points).mean(axis=0)
               for track, points in zip(tracks.followed, clouds, strict=True)]
     number = np.repeat(np.arange(len(clouds)), [len(points) for points in clouds])
     points = np.concatenate([np.empty((0, 3)), *clouds])

@@ -20,25 +20,32 @@ class Track:
 
     id           int             kept for as long as the object is followed
     points       (K, 3) float64  where its points should be, metres, in the frame of the latest scan
-    over_ground  (4, 4) float64  its last motion after ego-motion, in the same frame
+    over_ground  (4, 4) float64  the motion after ego-motion that it was last found with, in the same frame
+    took_s       float           seconds that this motion took
     missed       int             pairs since it was last found
     """
 
     id: int
     points: np.ndarray
     over_ground: np.ndarray
+    took_s: float
     missed: int = 0
 
-    def goes_on(self, ego_motion: np.ndarray) -> np.ndarray:
-        """Its motion over ground (4, 4) in the next pair, target frame, if it goes on as before."""
-        return ego_motion @ self.over_ground @ pose.inverse(ego_motion)
+    def goes_on(self, ego_motion: np.ndarray, dt_s: float) -> np.ndarray:
+        """Its motion over ground (4, 4) in the next `dt_s`, target frame, if it goes on as before."""
+        return pose.lasting(self._seen_after(ego_motion), self.took_s, dt_s)
 
-    def moved(self, ego_motion: np.ndarray) -> "Track":
-        """The track one pair later, if it goes on as before."""
-        over_ground = self.goes_on(ego_motion)
+    def moved(self, ego_motion: np.ndarray, dt_s: float) -> "Track":
+        """The track after a pair of `dt_s`, if it goes on as before."""
+        over_ground = self.goes_on(ego_motion, dt_s)
+        # The motion stays as it was found: scaled to a short pair and back it would not be as exact.
         return replace(
-            self, points=pose.apply(over_ground @ ego_motion, self.points), over_ground=over_ground,
-            missed=self.missed + 1)
+            self, points=pose.apply(over_ground @ ego_motion, self.points),
+            over_ground=self._seen_after(ego_motion), missed=self.missed + 1)
+
+    def _seen_after(self, ego_motion: np.ndarray) -> np.ndarray:
+        """Its motion (4, 4) as the sensor sees it one ego-motion later."""
+        return ego_motion @ self.over_ground @ pose.inverse(ego_motion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,12 +80,15 @@ def identify(tracks: Tracks, clouds: list[np.ndarray]) -> list[int]:
 
 def advance(
     tracks: Tracks, ids: list[int], clouds: list[np.ndarray], over_ground: list[np.ndarray],
-    ego_motion: np.ndarray,
+    ego_motion: np.ndarray, dt_s: float,
 ) -> Tracks:
-    """The tracks after a pair whose objects have `ids`, points (K, 3) and motions (4, 4) after ego-motion."""
+    """The tracks after a pair of `dt_s`.
+
+    Its objects have `ids`, points (K, 3), metres, source frame, and motions (4, 4) after ego-motion.
+    """
     found = [
-        Track(number, pose.apply(motion @ ego_motion, spread(points, _MAX_POINTS)), motion)
+        Track(number, pose.apply(motion @ ego_motion, spread(points, _MAX_POINTS)), motion, dt_s)
         for number, points, motion in zip(ids, clouds, over_ground, strict=True)]
-    missed = [track.moved(ego_motion) for track in tracks.followed
+    missed = [track.moved(ego_motion, dt_s) for track in tracks.followed
               if track.id not in ids and track.missed < _MAX_MISSED]
     return Tracks((*found, *missed), max([tracks.next_id, *(number + 1 for number in ids)]))
