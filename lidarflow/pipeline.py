@@ -37,7 +37,7 @@ from lidarflow.types import FlowResult, Scan, ScanPair, as_pair, as_scan
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Previous:
-    """What one pair leaves for the next: source points and result, its target's features and mesh.
+    """What one pair leaves for the next: source points, result, seconds, its target's features and mesh.
 
     Features and mesh are None where the result was known already, the mesh also where nothing is refined
     (`refine.rounds`); they are made when they are needed.
@@ -45,6 +45,7 @@ class Previous:
 
     points: np.ndarray
     result: FlowResult
+    took_s: float
     target: features.Features | None = None
     target_mesh: "Future[Mesh] | None" = None
 
@@ -126,7 +127,7 @@ class FlowEstimator:
                 tracks)
             result, self.tracks = explain(prepared, self.config, beside)
         self._odometry.found(result.ego_motion, pair.dt_s)
-        self._previous = Previous(source.points, result, prepared.target, prepared.target_mesh)
+        self._previous = Previous(source.points, result, pair.dt_s, prepared.target, prepared.target_mesh)
         return result
 
     def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
@@ -134,7 +135,7 @@ class FlowEstimator:
         last, self._previous = self._scan, None
         ego.follow(self._odometry, last, scan, known)
         if last is not None and known is not None:
-            self._previous = Previous(last.points, known)
+            self._previous = Previous(last.points, known, ScanPair(last, scan).dt_s)
         self._scan, self.tracks = scan, tracks
 
 
@@ -217,7 +218,7 @@ def prepare(
         source_mesh = begun_mesh.result()
     with timed("graph"):
         graph = begun_graph.result()
-        start_at = partial(_start, previous=previous, ego_motion=ego_motion, config=config)
+        start_at = partial(_start, previous=previous, ego_motion=ego_motion, dt_s=pair.dt_s, config=config)
         matches = frontend.matches(graph, *keypoints, start_at, pair.dt_s, config.matching)
     if search is None:
         with timed("matching"):
@@ -367,8 +368,8 @@ def _std(
 
 
 def _start(
-    points: np.ndarray, previous: Previous | None, ego_motion: np.ndarray, config: Config
+    points: np.ndarray, previous: Previous | None, ego_motion: np.ndarray, dt_s: float, config: Config
 ) -> np.ndarray:
     if previous is None or config.graph.start == "ego":
         return np.broadcast_to(ego_motion, (len(points), 4, 4))
-    return start.carried(points, previous.points, previous.result, ego_motion)
+    return start.carried(points, previous.points, previous.result, previous.took_s, ego_motion, dt_s)

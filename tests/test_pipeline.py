@@ -281,19 +281,39 @@ def test_motions_are_carried_to_where_their_points_went(drive):
     assert results[0] is None
     assert (starts[0][first.in_graph] == first.ego_motion).all()
     moved, known = scans[0].points + first.flow, first.in_graph & first.valid
-    carried = start.carried(moved, scans[0].points, first, second.ego_motion)
+    carried = start.carried(moved, scans[0].points, first, 0.1, second.ego_motion, 0.1)
     assert moved[known].shape == np.unique(moved[known], axis=0).shape   # so that the nearest is itself
     assert (carried[known] == first.motions[known]).all()
     far_away = start.carried(
-        moved[known] + [0.0, 0.0, 50.0], scans[0].points, first, second.ego_motion)
+        moved[known] + [0.0, 0.0, 50.0], scans[0].points, first, 0.1, second.ego_motion, 0.3)
     assert (far_away == second.ego_motion).all()
-    again = start.carried(scans[1].points, scans[0].points, first, second.ego_motion)
+    again = start.carried(scans[1].points, scans[0].points, first, 0.1, second.ego_motion, 0.1)
     assert (starts[1] == again)[second.in_graph].all()
     on_car = moves[1] & second.in_graph & second.valid
     begun_m = np.linalg.norm(pose.apply(starts[1][on_car], scans[1].points[on_car])
                              - scans[1].points[on_car] - second.flow[on_car], axis=1)
     by_ego_m = np.linalg.norm(second.residual_flow(scans[1].points)[on_car], axis=1)
     assert on_car.sum() > 100 and np.median(begun_m) < 0.2 < 0.5 < np.median(by_ego_m)
+
+
+def test_carried_motions_go_on_for_as_long_as_the_pair_takes(drive):
+    scans, moves, (_, first, second), _ = drive
+    longer = start.carried(scans[1].points, scans[0].points, first, 0.1, second.ego_motion, 0.3)
+    once = start.carried(scans[1].points, scans[0].points, first, 0.1, second.ego_motion, 0.1)
+    carried = (once != second.ego_motion).any(axis=(1, 2))
+    assert (carried & moves[1]).sum() > 100 and (longer[~carried] == second.ego_motion).all()
+    assert_allclose(longer[carried], (once @ once @ once)[carried], atol=1e-9)
+
+
+def test_a_known_pair_leaves_the_next_one_of_another_length_as_it_would_be(drive):
+    scans, _, (_, first, _), _ = drive
+    late = replace(scans[2], time_ns=scans[1].time_ns + 300_000_000)
+    whole, resumed = FlowEstimator(GRAPH_ALONE), FlowEstimator(GRAPH_ALONE)
+    for scan in scans[:2]:
+        whole.step(scan)
+    resumed.step(scans[0])
+    resumed.follow(scans[1], first, resumed.tracks)
+    assert (whole.step(late).flow == resumed.step(late).flow).all()
 
 
 def test_two_runs_with_one_ego_motion_give_the_same_bytes(drive):
