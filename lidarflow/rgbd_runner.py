@@ -86,12 +86,11 @@ def _write_pair(folder: RgbdFolder, step: Step, plan: Plan, out: Path, stream, w
     # A checkpoint is younger than its flow file, which may have been cut off since.
     if not (step.restored and io.is_whole(file)):
         rgbd_io.save_flow(file, pair.source, result, plan.config, stats_of(plan.method, report))
-    world_from_source = way.reached(step.index)
+    world_from_source = way.add(step.index, pair, result.odometry)
     if stream is not None:
         from lidarflow import rgbd_viewer
 
         rgbd_viewer.log_pair(stream, step.index, pair, result, report.residuals, world_from_source)
-    way.add(step.index, pair, result.odometry)
     return replace(report, seconds={**report.seconds, OUTPUT_STAGE: time.perf_counter() - begin})
 
 

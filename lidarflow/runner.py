@@ -212,13 +212,12 @@ def _write_pair(
             saved = there(None)
         report = report_pair(dataset, step.index, pair, result, config)
         saved.result()
-    world_from_source = way.reached(step.index)
+    world_from_source = way.add(step.index, pair, result.ego_motion)
     if stream is not None:
         from lidarflow import viewer
 
         score = (report.alignment.before, report.alignment.after)
         viewer.log_pair(stream, step.index, pair, result, score, world_from_source, arrows)
-    way.add(step.index, pair, result.ego_motion)
     return replace(report, seconds={**report.seconds, OUTPUT_STAGE: time.perf_counter() - begin})
 
 

@@ -16,6 +16,7 @@ from lidarflow.config import Config, EgoConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.datasets.argoverse2 import read_columns
 from lidarflow.runner import Going, Viewing, process
+from lidarflow.trajectory import Trajectory
 
 pytestmark = pytest.mark.usefixtures("in_tmp_path")
 
@@ -44,6 +45,25 @@ def made(tmp_path_factory):
 def run(made, tmp_path):
     """A folder of the run for one test, and the scans of the drive."""
     return shutil.copytree(made[0] / "run", tmp_path / "run"), made[1]
+
+
+def test_the_sensor_goes_on_over_a_gap_for_as_long_as_its_times_say():
+    def way_of(times_ns, ego_motion, frames=5, pairs=(0, 3)):
+        way = Trajectory(list(range(frames)))
+        for index in pairs:
+            way.go(index, (times_ns[index], times_ns[index + 1]), ego_motion)
+        return way
+
+    forward = pose.from_translation([-1.0, 0.0, 0.0])     # 10 m/s
+    slow = way_of([0, NS, 0, 11 * NS, 12 * NS], forward, frames=7)
+    np.testing.assert_allclose(slow.poses()[:, 0, 3], [0, 1, 6, 11, 12, 13, 14], atol=1e-9)
+    np.testing.assert_allclose(slow.timed()[1][:, 0, 3], [0, 1, 11, 12], atol=1e-9)
+    turning = pose.exp(np.array([0.01, 0.02, 0.3, 1.0, 0.2, 0.1]))
+    steps = pose.trajectory(np.tile(turning, (4, 1, 1)))
+    for times_ns in ([0, NS, 0, 3 * NS, 4 * NS], [0, 0, 0, 0, 0]):    # as long as always, and not known
+        np.testing.assert_array_equal(way_of(times_ns, turning).poses(), steps)
+    later = way_of([0, 0, 2 * NS, 3 * NS], forward, frames=4, pairs=(2,))
+    np.testing.assert_allclose(later.poses()[:, 0, 3], [0, 0, 0, 1], atol=1e-9)
 
 
 def motions(run_dir):

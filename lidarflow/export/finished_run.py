@@ -91,7 +91,9 @@ class FinishedRun:
         way = Trajectory(list(row_of.values()))
         for number in self.sources():
             world_from_source, world_from_target = self.world_from_sensor[number:number + 2]
-            way.go(row_of[self.scans[number]], pose.inverse(world_from_target) @ world_from_source)
+            begin_ns, end_ns = self.times_ns[number:number + 2].tolist()
+            way.go(row_of[self.scans[number]], (begin_ns, end_ns),
+                   pose.inverse(world_from_target) @ world_from_source)
         return way.poses()
 
     def config(self) -> Config:
