@@ -1,8 +1,9 @@
 """What a run keeps of every finished pair until it is complete, so that resuming it makes no difference.
 
 A checkpoint is an .npz file with the whole answer of a pair in full accuracy and the tracks after it, bound
-to the pair's points by a digest. It is written aside like all results and holds plain arrays only. What
-does not depend on the sensor serves rgbd_checkpoints.py too.
+to the pair's points by a digest, and to what came before by the stretch of scans that it lies in. It is
+written aside like all results and holds plain arrays only. What does not depend on the sensor serves
+rgbd_checkpoints.py too.
 """
 
 import contextlib
@@ -26,9 +27,25 @@ _PLAIN = ("valid", "in_graph", "is_dynamic", "ego_motion", "match_source", "matc
           "object_id", "std_m")
 _OF_OBJECTS = {"motion": (4, 4), "velocity": (3,), "box_centre": (3,), "box_size": (3,), "box_yaw": (),
                "points": ()}
-_NAMES = ("digest", *_PLAIN, "flow", "motion_table", "motion_row", "object_ids",
+_NAMES = ("digest", "stretch", *_PLAIN, "flow", "motion_table", "motion_row", "object_ids",
           *(f"object_{name}" for name in _OF_OBJECTS), "track_ids", "track_missed", "track_took_s",
           "track_over_ground", "track_counts", "track_points", "notes")
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Scans in a row without a gap: all that a pair takes over from what was before lies in its stretch.
+
+    first    int   index of its first scan
+    next_id  int   the first number that no object had before it
+    """
+
+    first: int
+    next_id: int
+
+    def row(self) -> np.ndarray:
+        """As (2,) int64."""
+        return np.array([self.first, self.next_id], np.int64)
 
 
 class CheckpointFiles:
@@ -40,6 +57,10 @@ class CheckpointFiles:
     def found(self) -> frozenset[int]:
         """Indices of the pairs that are kept."""
         return frozenset(int(file.stem) for file in self.folder.glob("*.npz") if file.stem.isdigit())
+
+    def stretch(self, index: int) -> Stretch:
+        """The stretch that the pair at `index` was computed in; DataError where its file is damaged."""
+        return stretch_of(self.file(index))
 
     def put(self, index: int, content: bytes) -> None:
         """Keep the bytes of the checkpoint of the pair at `index`."""
@@ -58,9 +79,11 @@ class CheckpointFiles:
 class Checkpoints(CheckpointFiles):
     """The checkpoints of a LiDAR run."""
 
-    def save(self, index: int, pair: ScanPair, result: FlowResult, tracks: Tracks) -> None:
-        """Keep the answer of the pair at `index`."""
-        self.put(index, packed(pair, result, tracks))
+    def save(
+        self, index: int, pair: ScanPair, result: FlowResult, tracks: Tracks, stretch: Stretch
+    ) -> None:
+        """Keep the answer of the pair at `index`, and the tracks after it."""
+        self.put(index, packed(pair, result, tracks, stretch))
 
     def load(self, index: int, pair: ScanPair) -> tuple[FlowResult, Tracks]:
         """The answer of the pair at `index`, and the tracks after it.
@@ -70,11 +93,12 @@ class Checkpoints(CheckpointFiles):
         return unpacked(self.file(index), pair)
 
 
-def packed(pair: ScanPair, result: FlowResult, tracks: Tracks) -> bytes:
+def packed(pair: ScanPair, result: FlowResult, tracks: Tracks, stretch: Stretch) -> bytes:
     """A pair's answer and the tracks after it as the bytes of an .npz file; equal input gives equal bytes."""
     motion_table, motion_row = _distinct(result.motions)
     arrays = {name: getattr(result, name) for name in _PLAIN} | {
-        "digest": np.array(_digest(pair)), "motion_table": motion_table, "motion_row": motion_row,
+        "digest": np.array(_digest(pair)), "stretch": stretch.row(),
+        "motion_table": motion_table, "motion_row": motion_row,
         # Most methods' flow follows from the motions to the last digit, and is not kept twice.
         "flow": result.flow if not _follows(pair.source, result) else np.empty((0, 3)),
         "object_ids": np.array([found.id for found in result.objects], np.int64),
@@ -118,6 +142,14 @@ def read_bound(
         raise DataError(f"{file}: was made of other data than {pair[0]} and {pair[1]} are now; the data "
                         "changed, run again without --resume")
     return arrays
+
+
+def stretch_of(file: Path) -> Stretch:
+    """The stretch of scans that the pair of a checkpoint lies in; DataError where the file is damaged."""
+    row = read_arrays(file, ("stretch",))["stretch"]
+    with naming_damage(file):
+        check("stretch", row, (2,), "i")
+    return Stretch(*row.tolist())
 
 
 def read_arrays(file: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -169,9 +201,9 @@ def numbers_of(file: Path) -> np.ndarray:
     return read_arrays(file, ("object_id",))["object_id"]
 
 
-def renumbered(file: Path, numbers: Numbers) -> dict[str, np.ndarray]:
-    """What is in a checkpoint, with other numbers of objects; tracks without one are let go."""
-    arrays = read_arrays(file, _NAMES)
+def renumbered(file: Path, numbers: Numbers, stretch: Stretch) -> dict[str, np.ndarray]:
+    """What is in a checkpoint, in the whole run's stretch and numbers of objects; tracks without one go."""
+    arrays = read_arrays(file, _NAMES) | {"stretch": stretch.row()}
     arrays["object_ids"] = np.array([numbers.of(old) for old in arrays["object_ids"].tolist()], np.int64)
     old, row = np.unique(arrays["object_id"], return_inverse=True)
     new = [numbers.of(number) if number >= 0 else -1 for number in old.tolist()]

@@ -19,7 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow import io, methods
-from lidarflow.checkpoints import Checkpoints, Numbers, numbers_of, packed, renumbered
+from lidarflow.checkpoints import (
+    Checkpoints,
+    Numbers,
+    Stretch,
+    numbers_of,
+    packed,
+    renumbered,
+    stretch_of,
+)
 from lidarflow.config import Config
 from lidarflow.datasets import Dataset, Source, open_dataset
 from lidarflow.errors import DataError, InstallError, LidarflowError
@@ -87,7 +95,7 @@ def explain_chunk(source: Source, chunk: Chunk, config: Config, method: str, ski
     try:
         frames = list(range(chunk.begin, chunk.stop + 1))
         for step in steps(Walk.of_scans(dataset, estimator), frames, None, _ignored if skip_bad else None):
-            found.append((step.index, packed(step.pair, step.result, step.tracks)))
+            found.append((step.index, packed(step.pair, step.result, step.tracks, step.stretch)))
     except LidarflowError as error:
         return Computed(tuple(found), " ".join(str(error).split()))
     return Computed(tuple(found), "")
@@ -132,7 +140,7 @@ def compute(
 
 def join(chunks: list[Chunk], kept: Checkpoints) -> None:
     """Make checkpoints of the run out of those of its chunks: every object has one number throughout."""
-    next_id, last = 0, {}
+    next_id, last, stretch = 0, {}, Stretch(chunks[0].begin, 0)
     for chunk in chunks:
         folder = _folder(kept, chunk)
         numbers = Numbers(_same_objects(folder, chunk, last), next_id)
@@ -142,7 +150,10 @@ def join(chunks: list[Chunk], kept: Checkpoints) -> None:
             for index in range(chunk.start, chunk.stop):
                 file = folder / f"{index:06d}.npz"
                 if file.is_file():     # a scan that was left out has none
-                    arrays = renumbered(file, numbers)
+                    # Where a worker began is no gap; its other stretches begin behind one.
+                    if stretch_of(file).first == index:
+                        stretch = Stretch(index, numbers.next_id)
+                    arrays = renumbered(file, numbers, stretch)
                     packing[index] = threads.submit(io.archive, arrays)
                     last[index] = arrays["object_id"]
             for index, content in packing.items():

@@ -5,20 +5,21 @@ import json
 import numpy as np
 
 from lidarflow import io, rgbd_io
-from lidarflow.checkpoints import CheckpointFiles, digest_of, naming_damage, read_bound
+from lidarflow.checkpoints import CheckpointFiles, Stretch, digest_of, naming_damage, read_bound
 from lidarflow.rgbd_types import RgbdPair, RgbdResult
 
-_NAMES = ("digest", *rgbd_io.RESULT_ARRAYS, "camera", "notes")
+_NAMES = ("digest", "stretch", *rgbd_io.RESULT_ARRAYS, "camera", "notes")
 
 
 class RgbdCheckpoints(CheckpointFiles):
     """The checkpoints of an RGB-D run: what goes from pair to pair is the last pair's answer and frame."""
 
-    def save(self, index: int, pair: RgbdPair, result: RgbdResult, tracks: None = None) -> None:
+    def save(self, index: int, pair: RgbdPair, result: RgbdResult, stretch: Stretch) -> None:
         """Keep the answer of the pair at `index`."""
         arrays = {name: getattr(result, name) for name in rgbd_io.RESULT_ARRAYS} | {
-            "digest": np.array(_digest(pair)), "notes": np.array(json.dumps({"seconds": result.seconds})),
-            "camera": rgbd_io.camera_row(result.camera)}
+            "digest": np.array(_digest(pair)), "stretch": stretch.row(),
+            "camera": rgbd_io.camera_row(result.camera),
+            "notes": np.array(json.dumps({"seconds": result.seconds}))}
         self.put(index, io.archive(arrays))
 
     def load(self, index: int, pair: RgbdPair) -> tuple[RgbdResult, None]:

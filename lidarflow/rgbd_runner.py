@@ -68,7 +68,7 @@ def process(
         for step in computed:
             reports.append(_write_pair(folder, step, plan, out, stream, way))
             if not step.restored:
-                kept.save(step.index, step.pair, step.result)
+                kept.save(step.index, step.pair, step.result, step.stretch)
             on_pair(reports[-1])
     run = RgbdRun(method, tuple(reports), _drift_along(way, folder.world_from_camera()))
     way.write_tum(out)

@@ -119,7 +119,7 @@ def process(
         for step in computed:
             reports.append(_write_pair(dataset, step, config, out, stream, way, viewing.arrows))
             if not step.restored:
-                kept.save(step.index, step.pair, step.result, step.tracks)
+                kept.save(step.index, step.pair, step.result, step.tracks, step.stretch)
             objects += _object_rows(step.pair.source.name, step.result)
             on_pair(reports[-1])
     reports = without_poorer_truth(reports)
@@ -175,6 +175,10 @@ def finish(
     figures  what metrics.json holds, but for the scans that are left out
     seconds  by frame and stage
     """
+    # What an interrupted run found of a scan that is left out now is no part of this one.
+    for file in (out / io.FLOW_FOLDER).glob("*.npz"):
+        if file.stem not in seconds:
+            file.unlink()
     provenance.write(out, replace(plan.source, skipped=tuple(scan.index for scan in skipped)))
     io.write_json(out / io.METRICS_FILE, {**figures, **_plain_skipped(skipped)})
     io.write_json(out / io.TIMING_FILE, seconds)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from lidarflow import io
+from lidarflow.checkpoints import Stretch
 from lidarflow.datasets import Dataset
 from lidarflow.errors import LidarflowError
 from lidarflow.lidar.tracking import Tracks
@@ -26,22 +27,26 @@ if TYPE_CHECKING:
 class Step:
     """A finished pair.
 
-    index     int   of its source scan in the data set; its target is the next
-    tracks          the objects that are followed after it; None for RGB-D frames
-    restored  bool  taken from a checkpoint
+    index     int      of its source scan in the data set; its target is the next
+    tracks    Tracks   the objects that are followed after it; None for RGB-D frames
+    stretch   Stretch  the scans without a gap that it lies in
+    restored  bool     taken from a checkpoint
     """
 
     index: int
     pair: ScanPair | RgbdPair
     result: FlowResult | RgbdResult
     tracks: Tracks | None
+    stretch: Stretch
     restored: bool
 
 
 class Kept(Protocol):
-    """Checkpoints: of which pairs there are, and the answer of one and the tracks after it."""
+    """Checkpoints: of which pairs there are, the stretch and the answer of one, and the tracks after it."""
 
     def found(self) -> frozenset[int]: ...
+
+    def stretch(self, index: int) -> Stretch: ...
 
     def load(self, index: int, pair: ScanPair | RgbdPair) -> tuple[
         FlowResult | RgbdResult, Tracks | None]: ...
@@ -88,17 +93,17 @@ def steps(
 ) -> Iterator[Step]:
     """Every pair of neighbouring scans, or frames, among `frames`, in order.
 
-    Pairs that are `kept` are not computed again. The estimator is led past them, so that what follows comes
-    out as if they had been computed; behind the last missing pair it is not needed any more.
+    Pairs that are `kept` are not computed again, but where scans have become usable or unusable before them
+    in their stretch, or a number has been given since that theirs might meet. The estimator is led past those
+    that are kept, so that what follows comes out as if they had been computed.
 
     With `on_skip` a scan that cannot be read or used is left out, and with it both its pairs: `on_skip` hears
     of it, and the estimator begins anew. Without, LidarflowError says which scan it is.
     """
     restorable = kept.found() if kept is not None else frozenset()
-    missing = [index for index in frames[:-1] if index not in restorable]
-    estimator, source = walk.estimator, None
+    estimator, source, stretch = walk.estimator, None, None
     for frame in frames:
-        is_known = source is not None and frame - 1 in restorable
+        is_known = source is not None and frame - 1 in restorable and kept.stretch(frame - 1) == stretch
         try:
             target = walk.read(frame)
             result = None if is_known else estimator.step(target)
@@ -110,14 +115,15 @@ def steps(
             estimator.reset()
             source = None
             continue
-        if is_known:
+        if source is None:
+            tracks = estimator.tracks
+            stretch = Stretch(frame, 0 if tracks is None else tracks.next_id)
+        else:
             pair = walk.pair(source, target)
-            result, tracks = kept.load(frame - 1, pair)
-            if missing and missing[-1] >= frame:
+            if is_known:
+                result, tracks = kept.load(frame - 1, pair)
                 estimator.follow(target, result, tracks)
-            yield Step(frame - 1, pair, result, tracks, True)
-        elif source is not None:
-            yield Step(frame - 1, walk.pair(source, target), result, estimator.tracks, False)
+            yield Step(frame - 1, pair, result, estimator.tracks, stretch, is_known)
         source = target
 
 

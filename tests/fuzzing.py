@@ -23,7 +23,7 @@ from cloud_files import POINTS, WRITERS
 from PIL import Image
 
 from lidarflow import config, evaluation, io, pose, provenance, rgbd_io
-from lidarflow.checkpoints import packed, unpacked
+from lidarflow.checkpoints import Stretch, packed, unpacked
 from lidarflow.config import Config
 from lidarflow.datasets import (
     argoverse2,
@@ -119,7 +119,7 @@ def _add_archives(add, pair, result, tracks):
     points = pair.source.points
     add("flow.npz", lambda file: io.save_flow(file, points, result, Config()),
         evaluation._read)
-    add("checkpoint.npz", lambda file: file.write_bytes(packed(pair, result, tracks)),
+    add("checkpoint.npz", lambda file: file.write_bytes(packed(pair, result, tracks, Stretch(0, 0))),
         lambda file: unpacked(file, pair))
     truth = {"flow": result.flow, "valid": result.valid, "dynamic": result.is_dynamic,
              "track": result.object_id, "target_from_source": result.ego_motion}

@@ -19,6 +19,7 @@ from lidarflow.checkpoints import Checkpoints, packed
 from lidarflow.config import Config
 from lidarflow.datasets import open_dataset
 from lidarflow.errors import DataError
+from lidarflow.lidar.tracking import Tracks
 from lidarflow.methods import METHODS
 from lidarflow.runner import Going, Viewing, process
 from lidarflow.stepping import Walk, steps
@@ -209,9 +210,10 @@ def test_a_checkpoint_comes_back_to_the_last_bit(street, tmp_path):
     for method in METHODS:
         estimator, kept = METHODS[method].along(Config()), Checkpoints(tmp_path / method)
         for step in steps(Walk.of_scans(open_dataset(street), estimator), [0, 1, 2]):
-            kept.save(step.index, step.pair, step.result, step.tracks)
+            kept.save(step.index, step.pair, step.result, step.tracks, step.stretch)
             result, tracks = kept.load(step.index, step.pair)
-            assert packed(step.pair, result, tracks) == packed(step.pair, step.result, step.tracks)
+            assert kept.stretch(step.index) == step.stretch
+            assert packed(step.pair, result, tracks, step.stretch) == kept.file(step.index).read_bytes()
             for name in ("flow", "motions", "valid", "std_m", "object_id", "match_target", "ego_motion"):
                 np.testing.assert_array_equal(getattr(result, name), getattr(step.result, name))
             assert result.seconds == step.result.seconds and len(result.objects) == len(step.result.objects)
@@ -225,7 +227,7 @@ def test_a_checkpoint_comes_back_to_the_last_bit(street, tmp_path):
 def test_a_damaged_checkpoint_is_named(street, tmp_path):
     kept = Checkpoints(tmp_path)
     step = next(steps(Walk.of_scans(open_dataset(street), METHODS["zero"].along(Config())), [0, 1]))
-    kept.save(0, step.pair, step.result, step.tracks)
+    kept.save(0, step.pair, step.result, step.tracks, step.stretch)
     file, = kept.folder.iterdir()
     file.write_bytes(file.read_bytes()[:-30])
     assert str(file) in message(kept.load, 0, step.pair)
@@ -281,6 +283,101 @@ def test_the_pair_after_a_gap_is_that_of_a_run_that_begins_there(damaged, street
     gap, fresh = (io.load_flow(tmp_path / name / "flow" / "000003.npz") for name in ("gap", "fresh"))
     np.testing.assert_array_equal(gap.flow, fresh.flow)
     np.testing.assert_array_equal(gap.object_id >= 0, fresh.object_id >= 0)
+
+
+def stopped(data, out, last, **going):
+    """A run that is interrupted once the pair `last` is kept."""
+    def stop(report):
+        if report.frame == last:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        process(open_dataset(data), list(range(SCANS)), Config(), out, QUIET, stop, going=Going(**going))
+
+
+def resumed(data, out):
+    """The bytes of a run that goes on and leaves out bad scans."""
+    process(open_dataset(data), list(range(SCANS)), Config(), out, QUIET,
+            going=Going(resume=True, skip_bad=True))
+    return contents(out)
+
+
+def test_a_scan_that_was_mended_leaves_no_trace(damaged, street, unbroken, tmp_path):
+    stopped(damaged, tmp_path / "run", "000003", skip_bad=True)
+    (damaged / "000002.bin").write_bytes((street / "000002.bin").read_bytes())
+    mended = resumed(damaged, tmp_path / "run")
+    assert {name: mended[name] for name in mended if name != "source.json"} == {
+        name: unbroken[name] for name in unbroken if name != "source.json"}
+
+
+def test_a_scan_that_was_damaged_since_is_left_out_as_if_it_had_always_been(damaged, street, tmp_path):
+    whole, cut = ((place / "000002.bin").read_bytes() for place in (street, damaged))
+    (damaged / "000002.bin").write_bytes(whole)
+    stopped(damaged, tmp_path / "run", "000003")
+    (damaged / "000002.bin").write_bytes(cut)
+    found = resumed(damaged, tmp_path / "run")
+    assert found == resumed(damaged, tmp_path / "fresh")
+    assert [name for name in found if name.startswith("flow/")] == ["flow/000000.npz", "flow/000003.npz"]
+
+
+class Counting:
+    """An estimator whose answers tell all they rest on: the scans since the last gap, and free numbers."""
+
+    def __init__(self):
+        self.tracks = Tracks()
+        self.reset()
+
+    def reset(self):
+        self._seen = ()
+
+    def step(self, scan):
+        self._seen += ((scan, self.tracks.next_id),)
+        if len(self._seen) == 1:
+            return None
+        self.tracks = Tracks(next_id=self.tracks.next_id + len(self._seen) % 3)
+        return self._seen
+
+    def follow(self, scan, known, tracks):
+        self._seen, self.tracks = known, tracks
+
+
+class Memory(dict):
+    """Checkpoints that are kept in memory, (stretch, answer, tracks) by index."""
+
+    def found(self):
+        return frozenset(self)
+
+    def stretch(self, index):
+        return self[index][0]
+
+    def load(self, index, pair):
+        return self[index][1:]
+
+
+def test_whatever_becomes_good_or_bad_between_interruptions_leaves_no_trace():
+    rng, count = np.random.default_rng(5), 12
+
+    def gone_through(bad, kept, most):
+        def read(index):
+            if index in bad:
+                raise DataError("bad")
+            return index
+
+        walk = Walk("made up", "scans", read, lambda source, target: (source, target), Counting())
+        found = []
+        for step in steps(walk, list(range(count)), kept, lambda skipped: None):
+            found.append((step.index, step.result, step.tracks.next_id))
+            kept[step.index] = step.stretch, step.result, step.tracks
+            if len(found) == most:
+                break
+        return found
+
+    for _ in range(300):
+        kept = Memory()
+        for _ in range(4):
+            bad = set(np.flatnonzero(rng.random(count) < 0.2).tolist())
+            gone_through(bad, kept, int(rng.integers(1, count)))
+        assert gone_through(bad, kept, count) == gone_through(bad, Memory(), count)
 
 
 def test_nothing_but_damaged_scans(street, tmp_path, lidarflow):

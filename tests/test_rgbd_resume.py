@@ -179,7 +179,7 @@ def test_other_commands_say_that_it_is_a_run_of_images(room, tmp_path, lidarflow
 def test_a_checkpoint_comes_back_to_the_last_bit(room, tmp_path, method):
     kept = RgbdCheckpoints(tmp_path)
     for step in steps(walk(room, method), [0, 1, 2]):
-        kept.save(step.index, step.pair, step.result)
+        kept.save(step.index, step.pair, step.result, step.stretch)
         result, _ = kept.load(step.index, step.pair)
         for name in ("flow", "points", "valid", "label", "b", "cluster_motions", "odometry", "is_dynamic",
                      "centres"):
@@ -192,7 +192,7 @@ def test_a_checkpoint_comes_back_to_the_last_bit(room, tmp_path, method):
 def test_a_damaged_checkpoint_is_named(room, tmp_path):
     kept = RgbdCheckpoints(tmp_path)
     step = next(steps(walk(room, "open3d"), [0, 1]))
-    kept.save(0, step.pair, step.result)
+    kept.save(0, step.pair, step.result, step.stretch)
     file, = kept.folder.iterdir()
     content = file.read_bytes()
     with np.load(file) as archive:
@@ -253,6 +253,24 @@ def test_a_frame_that_shows_nothing_of_the_one_before_is_skipped(room, tmp_path,
     told = lidarflow.ok("rgbd", "run", data, "--out", out, "--no-record", "--resume", "--skip-bad")
     assert "skipped    frame 2: odometry: 0%" in told and "2 pairs are left" in told
     assert sorted(os.listdir(out / "flow")) == [f"{NAMES[0]}.npz", f"{NAMES[3]}.npz"]
+
+
+def test_frames_behind_one_that_was_mended_are_computed_again(room, tmp_path, unbroken):
+    """What a pair takes over from the one before is not there behind a gap."""
+    data, out = copy_of(room, tmp_path / "data", damaged=(1,)), tmp_path / "run"
+
+    def stop(report):
+        if report.frame == NAMES[3]:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(data, out, going=Going(skip_bad=True), on_pair=stop)
+    assert sorted(RgbdCheckpoints(out).found()) == [2, 3]
+    copy_of(room, data)
+    run(data, out, going=Going(resume=True, skip_bad=True))
+    mended = contents(out)
+    assert {name: mended[name] for name in mended if name != "source.json"} == {
+        name: unbroken[name] for name in unbroken if name != "source.json"}
 
 
 def test_nothing_but_damaged_frames(room, tmp_path, lidarflow):
