@@ -54,6 +54,17 @@ def test_an_install_that_cannot_be_written_is_cached_with_the_user(package, monk
     assert package not in found.parents and found.name.startswith("lidarflow-")
 
 
+@pytest.mark.parametrize(("asked", "found"), [(None, "passive"), ("active", "active")])
+def test_threads_do_not_spin_while_they_wait_unless_the_user_wants_it(asked, found):
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    if asked is not None:
+        environment["OMP_WAIT_POLICY"] = asked
+    program = "import os; from lidarflow.kernels import compiled; print(os.environ['OMP_WAIT_POLICY'])"
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True,
+                          check=True)
+    assert done.stdout.strip() == found
+
+
 def test_kernels_are_cached_there_and_nothing_else_is():
     graphs.components(np.array([[0, 1]], np.int32), 2)
     assert compiled.are_cached()

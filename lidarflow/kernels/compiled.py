@@ -6,6 +6,7 @@ The cache therefore has a folder for each state of the sources and version of nu
 """
 
 import hashlib
+import os
 import tempfile
 from pathlib import Path
 
@@ -14,6 +15,9 @@ import platformdirs
 
 # TBB where it is too old makes numba warn on every start; OpenMP is as fast here.
 numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+# OpenMP reads it when it is loaded. Threads that spin while they wait for one another keep the cores from
+# those they wait for as soon as anything else runs: beside another program kernels take many times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def cache_folder(package: Path, wanted: str) -> Path:
