@@ -24,7 +24,8 @@ def test_a_folder_is_read_in_natural_order(tmp_path):
     data = open_dataset(tmp_path)
     assert [data.scan(i).name for i in range(3)] == ["scan1", "scan9", "scan10"]
     assert [data.scan(i).time_ns for i in range(3)] == [0, 100_000_000, 200_000_000]
-    assert (data.loader, data.note, data.truth(0), data.world_from_sensor()) == ("folder", "", None, None)
+    assert (data.loader, data.note, data.truth(0), data.world_from_sensor()) == (
+        "folder", "10 Hz assumed", None, None)
     assert "no scan 3; there are 3" in message(data.scan, 3)
     assert "no scan -1" in message(data.scan, -1)
 
@@ -60,16 +61,15 @@ def test_other_names_with_points_have_one_order_and_no_times(names):
     for order in (names, names[::-1]):
         files = [Path(f"{name}.npy") for name in order]
         assert [file.stem for file in natural_sorted(files)] == names
-        assert times_from_names(files) == [k * 100_000_000 for k in range(len(names))]
+        assert times_from_names(files) == []
 
 
 def test_seconds_in_names_are_exact():
     files = [Path(f"1700000000.{digits}.pcd") for digits in ("123456789", "123456791", "9")]
     assert times_from_names(files) == [1_700_000_000_123_456_789, 1_700_000_000_123_456_791,
                                        1_700_000_000_900_000_000]
-    again = times_from_names(files[::-1])
-    assert again == [0, 100_000_000, 200_000_000], "not increasing"
-    assert times_from_names([Path("99999999999.5.pcd"), Path("99999999999.6.pcd")])[0] == 0, "not 64 bits"
+    assert times_from_names(files[::-1]) == [], "not increasing"
+    assert times_from_names([Path("99999999999.5.pcd"), Path("99999999999.6.pcd")]) == [], "not 64 bits"
 
 
 @pytest.mark.parametrize("pair", [("1.bin", "1.BIN"), ("Scan1.bin", "scan1.bin")])
@@ -92,6 +92,11 @@ def test_times_come_from_names_or_from_a_file(tmp_path):
     assert open_dataset(tmp_path).scan(1).time_ns == 1_600_000_000
     (tmp_path / "times.txt").write_text("1.5\n1.6\n1.7\n")
     assert "times.txt has 3 times for 2 scans and is ignored" in open_dataset(tmp_path).note
+    for times in ("1.6\n1.5\n", "1.6\n1.6\n"):
+        (tmp_path / "times.txt").write_text(times)
+        data = open_dataset(tmp_path)
+        assert data.scan(1).time_ns == 315966265360032000, "those of the names"
+        assert f"times.txt has 1.6 s before {times[4:7]} s and is ignored" in data.note
     (tmp_path / "times.txt").write_text("soon\n")
     assert "expected 1 finite numbers per line, got 'soon'" in message(open_dataset, tmp_path)
 
@@ -209,7 +214,7 @@ def test_only_bin_files_are_taken_for_uncorrected_kitti_data(tmp_path):
     (tmp_path / "velodyne").mkdir()
     write_numpy(tmp_path / "velodyne" / "1.npy")
     data = open_dataset(tmp_path)
-    assert data.loader == "kitti_raw" and data.note == ""
+    assert data.loader == "kitti_raw" and data.note == "10 Hz assumed"
     np.testing.assert_array_equal(data.scan(0).points, POINTS)
 
 

@@ -36,7 +36,7 @@ def test_a_tracking_sequence_is_recognised(tmp_path):
     for folder in (tmp_path, part, part / "velodyne" / "0003"):
         data = open_dataset(folder)
         assert (guess_loader(folder), data.name, len(data)) == ("kitti_tracking", "kitti_tracking 0003", 5)
-    assert "correction on" in data.note and open_dataset(tmp_path, **OFF).note == ""
+    assert "correction on" in data.note and open_dataset(tmp_path, **OFF).note == "10 Hz assumed"
     drive.write_tracking(tmp_path, sequence="0012")
     assert "holds the sequences 0003, 0012; choose one" in message(open_dataset, tmp_path)
     assert open_dataset(tmp_path, sequence="12").name == "kitti_tracking 0012"
@@ -110,14 +110,15 @@ def test_a_missing_scan_has_no_truth(tmp_path):
 def test_flow_of_a_raw_drive_is_known(tmp_path, labels):
     folder = drive.write_raw(tmp_path, labels)
     data = open_dataset(folder, **OFF)
-    assert data.loader == "kitti_raw" and data.note == "poses from oxts"
+    assert data.loader == "kitti_raw" and data.note == "10 Hz assumed; poses from oxts"
     for frame in range(drive.FRAMES - 1):
         truth = check_truth(data, frame, 2e-6)
     assert truth.origin == ("boxes (tracklet_labels.xml)" if labels == "tracklets" else "boxes (boxes.csv)")
     assert set(truth.category.tolist()) == {Category.BACKGROUND, Category.CAR}
     (folder / "oxts" / "data" / "0000000001.txt").unlink()
     data = open_dataset(folder, **OFF)
-    assert data.truth(0) is None and data.note == "oxts/data lacks 1 of 5 packets and is ignored"
+    assert data.truth(0) is None and data.note == (
+        "10 Hz assumed; oxts/data lacks 1 of 5 packets and is ignored")
 
 
 @pytest.mark.parametrize(("labels", "text", "found"), [

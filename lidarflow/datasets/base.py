@@ -71,9 +71,11 @@ class ScanFiles:
         self.name = name
         self.files = list(files)
         clouds.check_names(self.files)
-        self.times_ns = list(times_ns) if times_ns is not None else times_from_names(self.files)
+        known_ns = list(times_ns) if times_ns is not None else times_from_names(self.files)
+        self.times_ns = known_ns or [index * DEFAULT_PERIOD_NS for index in range(len(self.files))]
         self.correct = correct
         assumed = ["KITTI vertical-angle correction on"] if correct else []
+        assumed += [] if known_ns else ["10 Hz assumed"]
         self.note = "; ".join([*assumed, *notes])
 
     def __len__(self) -> int:
@@ -123,11 +125,9 @@ def frame_number(file: Path) -> int | None:
 
 
 def times_from_names(files: Sequence[Path]) -> list[int]:
-    """Times in ns: the file names where all are increasing stamps, else 10 Hz from 0 on."""
+    """Times in ns: the file names where all are increasing stamps, else none."""
     times_ns = _stamps(files)
-    if times_ns and all(a < b for a, b in itertools.pairwise(times_ns)):
-        return times_ns
-    return [index * DEFAULT_PERIOD_NS for index in range(len(files))]
+    return times_ns if all(a < b for a, b in itertools.pairwise(times_ns)) else []
 
 
 def _stamps(files: Sequence[Path]) -> list[int]:

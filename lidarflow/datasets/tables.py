@@ -1,5 +1,6 @@
 """Small text files that lie beside scans: times and poses."""
 
+import itertools
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -89,7 +90,12 @@ def times_of_scans(path: Path, times_ns: list[int],
     picked = rows_of_scans(len(times_ns), files)
     if picked is None:
         return None, [f"{path.name} has {len(times_ns)} times for {len(files)} scans and is ignored"]
-    return [times_ns[row] for row in picked], []
+    found = [times_ns[row] for row in picked]
+    for earlier, later in itertools.pairwise(found):
+        if later <= earlier:
+            order = f"{earlier * 1e-9:.9g} s before {later * 1e-9:.9g} s"
+            return None, [f"{path.name} has {order} and is ignored"]
+    return found, []
 
 
 def read_motions(path: Path) -> np.ndarray:
