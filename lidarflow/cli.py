@@ -144,6 +144,7 @@ def pair(
     from lidarflow.tables import pair_table
 
     _print(pair_table(scans, result, alignment))
+    print(f"assumed    {_assumed(source, target, correction)}")
     print(f"method     {method}")
     print(f"flow       {out}")
     print(f"look at it with: lidarflow view {out} --target {target}")
@@ -374,6 +375,14 @@ def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
         stream = viewer.open_recording(aside)
         viewer.log_flow(stream, found.points, found.flow, found.is_dynamic, found.ego_motion, 0.1, points)
         viewer.close(stream, aside)
+
+
+def _assumed(source: Path, target: Path, kitti_correction: str) -> str:
+    """What was taken for granted of the scans in two files."""
+    from lidarflow.datasets import clouds
+
+    corrected = any(clouds.is_corrected(path, kitti_correction) for path in (source, target))
+    return "0.1 s between the scans" + ("; KITTI vertical-angle correction on" if corrected else "")
 
 
 def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:

@@ -115,6 +115,20 @@ def test_pair_reads_every_format_alike(lidarflow, tmp_path):
     assert sorted(os.listdir(tmp_path / "deep")) == sorted(f"{suffix}.npz" for suffix in WRITE)
 
 
+def test_pair_says_what_it_takes_for_granted(lidarflow, scans, tmp_path):
+    told = lidarflow.ok("pair", *scans[:2], "--out", tmp_path / "flow.npz", "--method", "zero")
+    assert "assumed    0.1 s between the scans; KITTI vertical-angle correction on\n" in told
+    told = lidarflow.ok("pair", *scans[:2], "--out", tmp_path / "flow.npz", "--method", "zero", "--set",
+                        "preparation.kitti_correction=off")
+    assert "assumed    0.1 s between the scans\n" in told
+
+
+def test_the_module_is_the_command_line(scans):
+    done = subprocess.run([sys.executable, "-m", "lidarflow", "--version"], capture_output=True, text=True,
+                          check=True)
+    assert done.stdout.startswith("lidarflow ")
+
+
 def test_pair_finds_the_ego_motion(lidarflow, scans, tmp_path):
     lidarflow.ok("pair", *scans[:2], "--out", tmp_path / "flow.npz", *OFF)
     found, truth = io.load_flow(tmp_path / "flow.npz"), drive()[0][1]

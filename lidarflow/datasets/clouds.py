@@ -58,9 +58,14 @@ def read_scan(path: Path | str, kitti_correction: str = "auto") -> Scan:
     """One cloud file as a Scan; "auto" corrects .bin files that lie where KITTI puts them."""
     path = Path(path)
     points = read_points(path)
-    if is_wanted(kitti_correction, path.suffix.lower() == ".bin" and is_kitti_folder(path.parent)):
+    if is_corrected(path, kitti_correction):
         points = correct_vertical_angle(points)
     return Scan(points, name=path.stem)
+
+
+def is_corrected(path: Path, kitti_correction: str) -> bool:
+    """Whether `read_scan` corrects the vertical angles of a file."""
+    return is_wanted(kitti_correction, path.suffix.lower() == ".bin" and is_kitti_folder(path.parent))
 
 
 def is_kitti_folder(folder: Path) -> bool:
