@@ -81,4 +81,4 @@ def check_motion(name: str, motion: np.ndarray) -> None:
     """Raise ValueError unless `motion` is a finite rigid motion (4, 4)."""
     check(name, motion, (4, 4), "f")
     if not pose.is_rigid(motion, tolerance=1e-4):
-        raise ValueError(f"{name}: expected a rigid motion, got\n{motion}")
+        raise ValueError(f"{name}: expected a rigid motion, got {motion.tolist()}")
