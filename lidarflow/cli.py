@@ -285,13 +285,13 @@ def view(
     import shutil
     import tempfile
 
-    from lidarflow import io, rgbd_io, viewer
+    from lidarflow import io, rgbd_io, run_folder, viewer
 
     _check_exists(what, "a run folder, a recording (.rrd) or a flow file (.npz)")
     if save is not None:
         io.check_output("--save", save, ".rrd", inputs=(what,))
     if what.is_dir() or what.suffix == ".rrd":
-        recording = io.find_recording(what)
+        recording = run_folder.find_recording(what)
         viewer.check_recording(recording)
         if save is None:
             viewer.open_in_viewer(recording)

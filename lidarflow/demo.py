@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, synthetic
+from lidarflow import run_folder, synthetic
 from lidarflow.errors import DataError
 from lidarflow.rgbd_types import Camera
 
@@ -24,13 +24,14 @@ def check_folder(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise DataError(f"{out}: is a file; expected a folder for the demo, choose another --out")
     names = {entry.name for entry in out.iterdir()} if out.is_dir() else set()
-    foreign = {name for name in names - {DATA_FOLDER, RUN_FOLDER, io.LATEST} if not _is_left_over(name)}
+    ours = {DATA_FOLDER, RUN_FOLDER, run_folder.LATEST}
+    foreign = {name for name in names - ours if not _is_left_over(name)}
     if foreign:
         some = ", ".join(sorted(foreign)[:3])
         raise DataError(f"{out}: holds files that are not an earlier demo's ({some}); "
                         "choose a new or an empty folder as --out")
     _check_data(out / DATA_FOLDER)
-    io.check_run_folder(out / RUN_FOLDER)
+    run_folder.check(out / RUN_FOLDER)
 
 
 def generate(folder: Path, scans: int | None = None) -> Path:

@@ -1,4 +1,4 @@
-"""Results on disk: flow files, poses, settings, and the folder of a run.
+"""Results on disk: flow files, poses, settings.
 
 Files are written aside and moved into place, so that a reader never meets half of one.
 """
@@ -7,8 +7,6 @@ import contextlib
 import csv
 import json
 import os
-import re
-import shutil
 import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
@@ -33,12 +31,9 @@ METRICS_FILE = "metrics.json"
 RECORDING_FILE = "recording.rrd"
 OBJECTS_FILE = "objects.csv"
 TIMING_FILE = "timing.json"      # what a run writes last
-RESULT_FILES = ("poses_kitti.txt", "poses_tum.txt", METRICS_FILE, TIMING_FILE, SOURCE_FILE, OBJECTS_FILE,
-                RECORDING_FILE, "preview.png")
 OBJECT_COLUMNS = ("frame", "id", "points", "x", "y", "z", "length", "width", "height", "yaw",
                   "vx", "vy", "vz", "speed_m_per_s")
 RESUME_FOLDER = ".resume"      # what a run keeps until it is complete
-LATEST = "latest"
 
 # name: (shape, after N for the arrays with a row per point; dtype kind)
 _ROW_ARRAYS = {"flow": ((3,), "f"), "points": ((3,), "f"), "motion": ((7,), "f"), "valid": ((), "b"),
@@ -223,106 +218,15 @@ def check_output(option: str, path: Path, suffix: str, inputs: tuple[Path, ...] 
         raise DataError(f"{option} {path}: is a folder; expected a file name")
     if any(path.exists() and file.exists() and path.samefile(file) for file in inputs):
         raise DataError(f"{option} {path}: is the input itself; choose another name")
-    _check_parents(option, path)
+    check_parents(option, path)
 
 
-def check_run_folder(out: Path) -> None:
-    """Raise DataError unless `out` is missing, empty or an earlier run: a folder that a run may fill."""
-    try:
-        if out.exists() and not out.is_dir():
-            raise DataError(f"{out}: is a file; expected a folder for the results, choose another --out")
-        names = {entry.name for entry in out.iterdir()} if out.is_dir() else set()
-    except OSError as error:
-        raise DataError(f"cannot write {out}: {error.strerror or error}; choose another --out") from error
-    if names and not _are_a_run(names):
-        some = ", ".join(sorted(names)[:3])
-        raise DataError(f"{out}: holds files that are not an earlier run's ({some}); "
-                        "choose a new or an empty folder as --out")
-    _check_parents("--out", out)
 
 
-def is_run(folder: Path) -> bool:
-    """Whether a folder holds an earlier run, finished or cut short."""
-    return folder.is_dir() and _are_a_run({entry.name for entry in folder.iterdir()})
 
 
-def find_recording(what: Path) -> Path:
-    """The recording of a run folder, or `what` itself where it is no folder; DataError if there is none."""
-    recording = what / RECORDING_FILE if what.is_dir() else what
-    if recording.is_file():
-        return recording
-    if recording == what:
-        raise DataError(f"{what}: no such recording")
-    if (what / FLOW_FOLDER).is_dir():
-        raise DataError(f"{what}: a run without {RECORDING_FILE} (cut short, or made with --no-record); "
-                        f"run it again, or view one of its files in {FLOW_FOLDER}")
-    raise DataError(f"{what}: no {RECORDING_FILE}; expected a folder that 'lidarflow run' wrote")
 
-
-def new_run_folder(out: Path) -> Path:
-    """`out`, made ready for the results of a run.
-
-    It may be missing, empty, or an earlier run, whose results are removed. Raises DataError for any
-    other folder: nothing that lidarflow did not write is touched.
-    """
-    out = Path(out)
-    check_run_folder(out)
-    try:
-        (out / FLOW_FOLDER).mkdir(parents=True, exist_ok=True)
-        # What a run could be resumed from goes first, so that no moment leaves it with another run's files.
-        shutil.rmtree(out / RESUME_FOLDER, ignore_errors=True)
-        for old in [*(out / FLOW_FOLDER).glob("*.npz"), *(out / name for name in RESULT_FILES)]:
-            old.unlink(missing_ok=True)
-        remove_left_overs(out)
-    except OSError as error:
-        raise DataError(f"cannot write {out}: {error.strerror or error}; choose another --out") from error
-    return out
-
-
-def remove_left_overs(out: Path) -> None:
-    """Remove what a killed run left half-written in its folder `out`."""
-    for folder in (out, out / FLOW_FOLDER, out / RESUME_FOLDER):
-        for left in folder.glob(".*.part"):
-            if is_left_over(left.name):
-                left.unlink(missing_ok=True)
-
-
-def is_left_over(name: str) -> bool:
-    """Whether a file of this name is one that `written_aside` had not finished."""
-    return re.fullmatch(r"\..+\.\d+\.part", name) is not None
-
-
-def link_latest(run_dir: Path) -> Path | None:
-    """Let `latest` beside `run_dir` link to it, and return the link.
-
-    None, and nothing changed, where `latest` is anything else than a link to a run beside it, where the run
-    is the working folder or one above it (its neighbours are none of our business), or where links cannot
-    be made.
-    """
-    run_dir = Path(os.path.abspath(run_dir))
-    link = run_dir.parent / LATEST
-    if run_dir == link or (os.path.lexists(link) and not _links_to_a_run(link)):
-        return None
-    if run_dir.resolve() in (Path.cwd(), *Path.cwd().parents):
-        return None
-    aside = link.with_name(f".{LATEST}.{os.getpid()}.part")
-    try:
-        aside.unlink(missing_ok=True)
-        aside.symlink_to(run_dir.name, target_is_directory=True)
-        os.replace(aside, link)
-    except OSError:
-        return None
-    return link
-
-
-def _links_to_a_run(link: Path) -> bool:
-    """Whether `link` is one that `link_latest` made: to a run beside it, or to one that is gone."""
-    if not link.is_symlink() or os.sep in os.readlink(link):
-        return False
-    return not link.exists() or is_run(link)
-
-
-def _check_parents(option: str, path: Path) -> None:
+def check_parents(option: str, path: Path) -> None:
     """Raise DataError where a folder above `path` cannot be one, or cannot be written to."""
     nearest = next(parent for parent in path.absolute().parents if os.path.exists(parent))
     if not nearest.is_dir():
@@ -330,11 +234,6 @@ def _check_parents(option: str, path: Path) -> None:
     if not os.access(nearest, os.W_OK):
         raise DataError(f"{option} {path}: {nearest} cannot be written to; choose another {option}")
 
-
-def _are_a_run(names: set[str]) -> bool:
-    """Whether these are the entries of an earlier run's folder."""
-    names = {name for name in names if not is_left_over(name)}
-    return FLOW_FOLDER in names and (CONFIG_FILE in names or names <= {FLOW_FOLDER, SOURCE_FILE})
 
 
 def read_archive(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

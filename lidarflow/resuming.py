@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from lidarflow import io, provenance
+from lidarflow import io, provenance, run_folder
 from lidarflow.config import Config, load, to_dict
 from lidarflow.datasets.rgbd_folders import RgbdSource
 from lidarflow.errors import DataError
@@ -43,7 +43,7 @@ class Plan:
 
 def begin(out: Path, plan: Plan) -> None:
     """Make `out` ready for a run from its start; what an earlier run left there is removed."""
-    io.new_run_folder(out)
+    run_folder.make(out)
     io.write_toml(out / io.CONFIG_FILE, plan.config, plan.comment)
     provenance.write(out, plan.source)
 

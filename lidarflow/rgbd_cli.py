@@ -147,7 +147,7 @@ def show_config() -> None:
 def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Path, viewing: "Viewing",
              jump: int = 0, n_frames: int | None = None, going: "Going | None" = None) -> None:
     """Run over a folder and say what was found."""
-    from lidarflow import io, rgbd_runner, runner
+    from lidarflow import rgbd_runner, run_folder, runner
     from lidarflow.resuming import damaged_files
     from lidarflow.rgbd_tables import run_notes, run_table
     from lidarflow.tables import complete_line, replaced_line, skipped_lines, where_results_are
@@ -161,8 +161,8 @@ def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Pat
         print(complete_line(out, damaged))
         if not damaged:
             return
-    io.check_run_folder(out)
-    if not going.resume and io.is_run(out):
+    run_folder.check(out)
+    if not going.resume and run_folder.is_run(out):
         print(replaced_line(out))
     announce_first_use()
     with progress("frame pairs", len(frames) - 1) as bar:

@@ -63,7 +63,7 @@ def process(
     method: str = "ours", going: "Going | None" = None, spread: Spread | None = None,
 ) -> None:
     """Run over a data set and say what was found."""
-    from lidarflow import io, runner
+    from lidarflow import run_folder, runner
     from lidarflow.resuming import damaged_files
     from lidarflow.tables import (
         complete_line,
@@ -83,8 +83,8 @@ def process(
         print(complete_line(out, damaged))
         if not damaged:
             return
-    io.check_run_folder(out)
-    if not going.resume and io.is_run(out):
+    run_folder.check(out)
+    if not going.resume and run_folder.is_run(out):
         print(replaced_line(out))
     if spread is not None:
         _compute(dataset, frames, settings, out, method, going, spread)
@@ -107,10 +107,10 @@ def process(
 def _compute(dataset: "Dataset", frames: list[int], settings: "Config", out: Path, method: str,
              going: "Going", spread: Spread) -> None:
     """Have the pairs computed by workers; the run is put together of what they find."""
-    from lidarflow import cluster, io, runner
+    from lidarflow import cluster, run_folder, runner
 
     chunks = cluster.chunks_of(frames, spread.chunk, settings)
-    io.check_run_folder(out)
+    run_folder.check(out)
     with cluster.connected(spread.workers, spread.scheduler) as client, progress(
             "scan pairs computed", len(frames) - 1) as bar:
         kept = runner.begin(dataset, frames, settings, out, method, going)

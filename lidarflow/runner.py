@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidarflow import io, methods, metrics, pose, preview, provenance, resuming
+from lidarflow import io, methods, metrics, pose, preview, provenance, resuming, run_folder
 from lidarflow.aside import Aside, ahead, there
 from lidarflow.checkpoints import CheckpointFiles, Checkpoints
 from lidarflow.config import Config
@@ -151,7 +151,7 @@ def begun_steps(walk: Walk, plan: Plan, kept: Kept, out: Path, going: Going
         skipped.append(scan)
         going.on_skip(scan)
 
-    io.check_run_folder(out)
+    run_folder.check(out)
     begun = going.resume and state_of(out, plan) is State.BEGUN
     found = steps(walk, list(plan.source.scans), kept if begun else None, on_skip if going.skip_bad else None)
     done = saying_what_is_kept(found, out)
@@ -160,7 +160,7 @@ def begun_steps(walk: Walk, plan: Plan, kept: Kept, out: Path, going: Going
         raise DataError(f"{walk.name}: no two neighbouring {walk.what} can be used; the first that cannot: "
                         f"{skipped[0].reason}")
     if begun:
-        io.remove_left_overs(out)
+        run_folder.remove_left_overs(out)
     else:
         resuming.begin(out, plan)
     return itertools.chain([first], done), skipped
@@ -183,13 +183,13 @@ def finish(
     io.write_json(out / io.METRICS_FILE, {**figures, **_plain_skipped(skipped)})
     io.write_json(out / io.TIMING_FILE, seconds)
     kept.remove()
-    io.link_latest(out)
+    run_folder.link_latest(out)
 
 
 def begin(dataset: Dataset, frames: list[int], config: Config, out: Path, method: str, going: Going
           ) -> Checkpoints:
     """Make `out` ready for checkpoints that others compute; those of an interrupted run stay."""
-    io.check_run_folder(out)
+    run_folder.check(out)
     plan = plan_of(dataset, frames, config, method, going)
     if not (going.resume and state_of(out, plan) is State.BEGUN):
         resuming.begin(out, plan)

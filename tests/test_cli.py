@@ -21,6 +21,7 @@ from lidarflow import (
     io,
     metrics,
     pose,
+    run_folder,
     runner,
     synthetic,
     tables,
@@ -333,19 +334,19 @@ def test_scans_of_several_sensors_are_pointed_out(lidarflow, tmp_path):
 # latest
 
 def test_latest_replaces_no_link_of_the_users(tmp_path):
-    run = io.new_run_folder(tmp_path / "runs" / "a")
+    run = run_folder.make(tmp_path / "runs" / "a")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "text").touch()
     for target in (tmp_path / "thesis", "../thesis"):
         (tmp_path / "runs" / "latest").symlink_to(target)
-        assert io.link_latest(run) is None and (tmp_path / "runs" / "latest" / "text").exists()
+        assert run_folder.link_latest(run) is None and (tmp_path / "runs" / "latest" / "text").exists()
         (tmp_path / "runs" / "latest").unlink()
 
 
 def test_latest_is_not_put_above_the_working_folder(tmp_path, monkeypatch):
-    io.new_run_folder(tmp_path / "here")
+    run_folder.make(tmp_path / "here")
     monkeypatch.chdir(tmp_path / "here")
-    assert io.link_latest(".") is None and os.listdir(tmp_path) == ["here"]
+    assert run_folder.link_latest(".") is None and os.listdir(tmp_path) == ["here"]
 
 
 # view

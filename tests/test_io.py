@@ -11,7 +11,7 @@ import pytest
 from cloud_files import message
 
 from lidarflow import config as settings
-from lidarflow import io, pose
+from lidarflow import io, pose, run_folder
 from lidarflow.config import Config
 from lidarflow.types import FlowResult, SolveStats
 
@@ -224,37 +224,37 @@ def test_missing_folders_are_made(tmp_path):
 # --- run folders ---
 
 def test_a_run_folder_is_made_and_used_again(tmp_path):
-    run = io.new_run_folder(tmp_path / "runs" / "a")
-    assert (run / "flow").is_dir() and io.new_run_folder(run) == run, "a run cut short may be repeated"
+    run = run_folder.make(tmp_path / "runs" / "a")
+    assert (run / "flow").is_dir() and run_folder.make(run) == run, "a run cut short may be repeated"
     io.write_toml(run / "config.toml", Config())
     for name in ("flow/000007.npz", "metrics.json", "objects.csv", "notes.txt"):
         (run / name).write_text("old")
-    io.new_run_folder(run)
+    run_folder.make(run)
     assert sorted(entry.name for entry in run.iterdir()) == ["config.toml", "flow", "notes.txt"]
     assert not list((run / "flow").iterdir()), "an old frame would count as one of the new run"
 
 
 def test_foreign_folders_are_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    assert "not an earlier run's (thesis.tex)" in message(io.new_run_folder, tmp_path)
+    assert "not an earlier run's (thesis.tex)" in message(run_folder.make, tmp_path)
     (tmp_path / "config.toml").touch()
-    assert "not an earlier run's" in message(io.new_run_folder, tmp_path)
-    assert "is a file" in message(io.new_run_folder, tmp_path / "thesis.tex")
+    assert "not an earlier run's" in message(run_folder.make, tmp_path)
+    assert "is a file" in message(run_folder.make, tmp_path / "thesis.tex")
     assert sorted(os.listdir(tmp_path)) == ["config.toml", "thesis.tex"]
     (tmp_path / "empty").mkdir()
-    assert (io.new_run_folder(tmp_path / "empty") / "flow").is_dir()
+    assert (run_folder.make(tmp_path / "empty") / "flow").is_dir()
 
 
 def test_latest_links_to_the_newest_run(tmp_path):
     for name in ("a", "b"):
-        run = io.new_run_folder(tmp_path / name)
-        assert io.link_latest(run) == tmp_path / "latest"
+        run = run_folder.make(tmp_path / name)
+        assert run_folder.link_latest(run) == tmp_path / "latest"
         assert os.readlink(tmp_path / "latest") == name
     assert sorted(os.listdir(tmp_path)) == ["a", "b", "latest"]
-    assert io.link_latest(tmp_path / "latest") is None
+    assert run_folder.link_latest(tmp_path / "latest") is None
 
 
 def test_a_real_folder_called_latest_stays(tmp_path):
     (tmp_path / "latest").mkdir()
-    assert io.link_latest(io.new_run_folder(tmp_path / "a")) is None
+    assert run_folder.link_latest(run_folder.make(tmp_path / "a")) is None
     assert (tmp_path / "latest").is_dir() and not (tmp_path / "latest").is_symlink()
