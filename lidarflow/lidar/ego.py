@@ -159,8 +159,7 @@ class LastMotion:
         last, self._last = self._last, None
         if last is None:
             return None
-        motion, took_s = last
-        return motion if took_s == dt_s else pose.interpolate(np.eye(4), motion, dt_s / took_s)
+        return pose.lasting(*last, dt_s)
 
     def found(self, motion: np.ndarray, dt_s: float) -> None:
         """Hear what the motion (4, 4) to the last scan was."""
