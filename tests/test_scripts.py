@@ -60,6 +60,11 @@ def test_baseline_variants(street):
     assert found.count("\n| ") > 5
 
 
+def test_open_places():
+    found = printed("open_places", "--seeds", 1, "--pairs", 1)
+    assert found.count("\n") == 14 and "| HDL-32E | 8 | 1 | 0 | 0 | 0.0" in found
+
+
 def test_ego_guesses(street):
     found = printed("ego_guesses", street)
     name, pairs, median_m, *_ = row(found, "street3")
