@@ -37,10 +37,14 @@ def make(out: Path) -> Path:
     """`out`, made ready for the results of a run.
 
     It may be missing, empty, or an earlier run, whose results are removed. Raises DataError for any
-    other folder: nothing that lidarflow did not write is touched.
+    other folder, nothing that lidarflow did not write is touched, and for the link to the latest run, which
+    would be lost under another's name.
     """
     out = Path(out)
     check(out)
+    if out.name == LATEST and _links_to_a_run(out):
+        raise DataError(f"{out}: is a link to the run in {os.readlink(out)}; choose another --out, or go on "
+                        "with that run by --resume")
     try:
         (out / io.FLOW_FOLDER).mkdir(parents=True, exist_ok=True)
         # What a run could be resumed from goes first, so that no moment leaves it with another run's files.

@@ -252,6 +252,7 @@ def test_latest_links_to_the_newest_run(tmp_path):
         assert os.readlink(tmp_path / "latest") == name
     assert sorted(os.listdir(tmp_path)) == ["a", "b", "latest"]
     assert run_folder.link_latest(tmp_path / "latest") is None
+    assert "is a link to the run in" in message(run_folder.make, tmp_path / "latest")
 
 
 def test_a_real_folder_called_latest_stays(tmp_path):
