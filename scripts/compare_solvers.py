@@ -39,7 +39,7 @@ def problem_of(pair: ScanPair, config: settings.Config) -> tuple:
     seen = []
 
     def remember(problem, wanted, min_matches):
-        if wanted is config.solver:     # refinement has settings of its own
+        if wanted == config.solver:     # refinement has settings of its own
             seen.append((problem, wanted, min_matches))
         return solve.solve(problem, wanted, min_matches)
 

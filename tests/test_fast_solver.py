@@ -213,7 +213,7 @@ def test_scans_agree_with_gtsam(folder, monkeypatch):
     monkeypatch.setattr(pipeline, "solve", remember)
     pipeline.estimate_flow(ScanPair(dataset.scan(0), dataset.scan(1)), config)
     # The others refine, to no more than a percent.
-    (problem, solver, min_matches), = [given for given in seen if given[1] is config.solver]
+    (problem, solver, min_matches), = [given for given in seen if given[1] == config.solver]
     assert len(problem.points) > 1000 and len(problem.group)
     assert_agreement(problem, solver, min_matches)
 
