@@ -221,11 +221,6 @@ def check_output(option: str, path: Path, suffix: str, inputs: tuple[Path, ...] 
     check_parents(option, path)
 
 
-
-
-
-
-
 def check_parents(option: str, path: Path) -> None:
     """Raise DataError where a folder above `path` cannot be one, or cannot be written to."""
     nearest = next(parent for parent in path.absolute().parents if os.path.exists(parent))
@@ -233,7 +228,6 @@ def check_parents(option: str, path: Path) -> None:
         raise DataError(f"{option} {path}: {nearest} is a file; expected a folder")
     if not os.access(nearest, os.W_OK):
         raise DataError(f"{option} {path}: {nearest} cannot be written to; choose another {option}")
-
 
 
 def read_archive(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -107,10 +107,9 @@ def process(
 def _compute(dataset: "Dataset", frames: list[int], settings: "Config", out: Path, method: str,
              going: "Going", spread: Spread) -> None:
     """Have the pairs computed by workers; the run is put together of what they find."""
-    from lidarflow import cluster, run_folder, runner
+    from lidarflow import cluster, runner
 
     chunks = cluster.chunks_of(frames, spread.chunk, settings)
-    run_folder.check(out)
     with cluster.connected(spread.workers, spread.scheduler) as client, progress(
             "scan pairs computed", len(frames) - 1) as bar:
         kept = runner.begin(dataset, frames, settings, out, method, going)
