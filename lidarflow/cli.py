@@ -14,6 +14,7 @@ import typer
 
 from lidarflow import __version__
 from lidarflow.errors import LidarflowError
+from lidarflow.eval_cli import evaluate
 from lidarflow.export_cli import export
 from lidarflow.rgbd_cli import app as rgbd_app
 from lidarflow.run_cli import Spread, open_data, pairs_done, process
@@ -224,37 +225,7 @@ def compare(
         print(f"figures    {out}")
 
 
-@app.command(name="eval")
-def evaluate(
-    what: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="A run folder, or a flow file (.npz).")],
-    truth: Annotated[Path | None, typer.Option(
-        help="Folder of <scan>.npz with the truth, or one file; that of the data if not given.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Where the run's data are now, if they moved.")] = None,
-    out: Annotated[Path | None, typer.Option(
-        "--out", help="Metrics file (.json) to write; RUN_DIR/metrics.json if not given.")] = None,
-) -> None:
-    """Score results against the truth."""
-    from lidarflow import evaluation, io, score_tables
-    from lidarflow.tables import run_table
-
-    _check_exists(what, "a run folder or a flow file (.npz)")
-    if out is not None:
-        io.check_output("--out", out, ".json", inputs=(what,))
-    with _working(f"scores of {what}"):
-        if what.is_dir():
-            done = evaluation.evaluate_run(what, truth, data)
-            out = out or what / io.METRICS_FILE
-        else:
-            done = evaluation.evaluate_file(what, truth)
-        if out is not None:
-            io.write_json(out, done.metrics())
-    print(f"results    {what}")
-    print(f"truth      {done.truth}, from {done.truth_place}\n")
-    for table in (run_table(done.reports, done.config), *score_tables.tables_of(done)):
-        _print(table)
-        print()
-    if out is not None:
-        print(f"metrics    {out}")
+app.command(name="eval")(evaluate)
 
 
 @app.command(name="report")

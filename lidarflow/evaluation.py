@@ -1,5 +1,6 @@
 """Scores of results on disk: a run folder or a flow file, against its data set's truth or a given one."""
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
 _UNKNOWN = float("nan")
 _SAME_POINT_M = 1e-3
+_SAME_CRISPNESS = 1e-4
 _NAMED = 3     # how many of several names a message shows
 
 
@@ -26,11 +28,13 @@ class Evaluation:
     """Scores of results: one report per pair, and what they were made with.
 
     truth_place  where the truth is, for people
+    notes        what the figures lack, and why
     """
 
     reports: list[PairReport]
     config: Config
     truth_place: str
+    notes: tuple[str, ...] = ()
 
     @property
     def truth(self) -> str:
@@ -49,6 +53,9 @@ def evaluate_run(run_dir: Path, truth: Path | None = None, data: Path | None = N
            data set has
     data   where the run's data set is now, if not where it was
 
+    With a `truth` the data set need not be at hand. The crispness of pairs whose target is no other pair's
+    source is then what the run recorded; the notes say so, or that it is not known.
+
     Raises DataError where a scan lacks its flow or its truth, a file belongs to another cloud, or there is no
     truth at all.
     """
@@ -56,18 +63,21 @@ def evaluate_run(run_dir: Path, truth: Path | None = None, data: Path | None = N
     files = natural_sorted((run_dir / io.FLOW_FOLDER).glob("*.npz"))
     if not files:
         raise DataError(f"{run_dir}: no flow files in {io.FLOW_FOLDER}; was the run cut short? run it again")
-    dataset = _opened(source.dataset, data, needed=truth is None, run_dir=run_dir)
+    dataset, notes = _opened(source.dataset, data, needed=truth is None, run_dir=run_dir), ()
     if dataset is None:
         if len(files) != len(source.pairs):
             raise DataError(f"{run_dir}: {len(files)} flow files for {len(source.pairs)} pairs; "
                             "was the run cut short? run it again")
-        reports = [_from_files(file, following, truth, len(files), config)
-                   for file, following in zip(files, _following(files, source), strict=True)]
+        following, recorded = _following(files, source), _recorded(run_dir, config)
+        reports = [_from_files(file, after, truth, len(files), config, recorded.get(file.stem))
+                   for file, after in zip(files, following, strict=True)]
+        alone = [file.stem for file, after in zip(files, following, strict=True) if after is None]
+        notes = tuple(_notes_on_crispness(alone, recorded, source))
     else:
         reports = list(_from_dataset(run_dir, files, dataset, source, truth, config))
     place = str(truth) if truth is not None else str(dataset.source.folder)
     _check_truths(place, reports)
-    return Evaluation(reports, config, place)
+    return Evaluation(reports, config, place, notes)
 
 
 def evaluate_file(file: Path, truth: Path | None) -> Evaluation:
@@ -117,6 +127,7 @@ def _from_dataset(
 ) -> Iterator[PairReport]:
     """A report for every pair that the run went through, scans read once each."""
     _check_length(dataset, run.scans, run_dir)
+    sources, recorded = {index for index, _ in run.pairs}, _recorded(run_dir, config)
     left = {file.stem: file for file in files}
     last, target = None, None
     for index, following in run.pairs:
@@ -134,6 +145,8 @@ def _from_dataset(
             known = _given_truth(truth, source.name, len(source), len(run.pairs))
             origin = known.origin
         alignment = metrics.alignment(source, target, result, config.crispness.sigma_m)
+        if following not in sources:
+            _check_target(run_dir, dataset, source, target, alignment, recorded.get(source.name))
         yield runner.report_result(source, result, None, alignment, known, origin)
     if left:
         raise DataError(f"{run_dir}: flow of {_some(sorted(left))}, which is no scan of {dataset.name} "
@@ -146,14 +159,45 @@ def _following(files: list[Path], run: RunSource) -> list[Path | None]:
     return [file_of.get(following) for _, following in run.pairs]
 
 
+def _recorded(run_dir: Path, config: Config) -> dict[str, metrics.Alignment]:
+    """Crispness by scan that metrics.json has of a run; none where it is missing, damaged or of another σ."""
+    found = {}
+    try:
+        for pair in json.loads((run_dir / io.METRICS_FILE).read_text(encoding="utf-8"))["pairs"]:
+            values = metrics.Alignment(**pair["alignment"])
+            if values.sigma_m == config.crispness.sigma_m and np.isfinite(values.after):
+                found[pair["frame"]] = values
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return {}     # eval is what writes a damaged file anew
+    return found
+
+
+def _notes_on_crispness(
+    alone: list[str], recorded: dict[str, metrics.Alignment], run: RunSource
+) -> Iterator[str]:
+    """What is said of the pairs from the scans `alone`, whose next scan is not at hand."""
+    place = "not at hand" if run.dataset is None else f"in {run.dataset.folder}, which is gone"
+    kept = [name for name in alone if name in recorded]
+    if kept:
+        yield f"crispness of {_some(kept)} is what the run recorded: the next scan is {place}"
+    unknown = [name for name in alone if name not in recorded]
+    if unknown:
+        yield f"crispness of {_some(unknown)} is not known, and no part of the mean: the next scan is {place}"
+
+
 def _from_files(
-    file: Path, following: Path | None, truth: Path, pairs: int, config: Config
+    file: Path, following: Path | None, truth: Path, pairs: int, config: Config,
+    recorded: metrics.Alignment | None = None,
 ) -> PairReport:
-    """A report without the data set: the target is the cloud of the `following` flow file, if any."""
+    """A report without the data set: the target is the cloud of the `following` flow file, if any.
+
+    Without, the crispness is what was `recorded`.
+    """
     points, result = _read(file)
     source = Scan(points, name=file.stem)
     known = _given_truth(truth, source.name, len(source), pairs)
-    alignment = metrics.Alignment(_UNKNOWN, _UNKNOWN, _UNKNOWN, config.crispness.sigma_m)
+    unknown = metrics.Alignment(_UNKNOWN, _UNKNOWN, _UNKNOWN, config.crispness.sigma_m)
+    alignment = recorded or unknown
     if following is not None:
         target = Scan(io.load_flow(following).points, name=following.stem)
         alignment = metrics.alignment(source, target, result, config.crispness.sigma_m)
@@ -202,6 +246,18 @@ def _check_points(file: Path, points: np.ndarray, scan: Scan, dataset: Dataset) 
     if np.nanmax(apart_m, initial=0.0) > _SAME_POINT_M:
         raise DataError(f"{file}: its points are not those of scan {scan.name} of {dataset.name}, "
                         f"up to {np.nanmax(apart_m):.3g} m apart; is this the data of the run?")
+
+
+def _check_target(
+    run_dir: Path, dataset: Dataset, source: Scan, target: Scan, found: metrics.Alignment,
+    recorded: metrics.Alignment | None,
+) -> None:
+    """Raise DataError where a target that no flow file has the points of is another than the run had."""
+    if recorded is not None and abs(found.before - recorded.before) > _SAME_CRISPNESS:
+        raise DataError(
+            f"{dataset.name}: scan {target.name} is not the one that the flow of {source.name} leads to: "
+            f"crispness before any motion is {found.before:.4f}, not {recorded.before:.4f} as in "
+            f"{run_dir / io.METRICS_FILE}; is this the data of the run? without that file it is not compared")
 
 
 def _check_truths(place: str, reports: list[PairReport]) -> None:

@@ -88,8 +88,25 @@ def test_a_truth_folder_will_do(lidarflow, data, run):
     check_scores(metrics_of(run))
     shutil.move(truth_folder(data), "truth")
     shutil.rmtree(data)
-    lidarflow.ok("eval", "run", "--truth", "truth")
+    (run / "metrics.json").unlink()
+    said = lidarflow.ok("eval", "run", "--truth", "truth")
     check_scores(metrics_of(run), crisp_pairs=1)
+    assert ("note       crispness of 000001 is not known, and no part of the mean: the next scan is in "
+            f"{data}, which is gone\n") in said
+
+
+def test_crispness_that_was_recorded_is_kept_where_the_data_are_gone(lidarflow, data, run):
+    lidarflow.ok("eval", "run")
+    before = metrics_of(run)
+    shutil.move(truth_folder(data), "truth")
+    shutil.rmtree(data)
+    said = lidarflow.ok("eval", "run", "--truth", "truth")
+    assert f"crispness of 000001 is what the run recorded: the next scan is in {data}, which is gone" in said
+    assert metrics_of(run) == before
+    (run / "metrics.json").write_text(json.dumps(before | {"pairs": [{"frame": "000001"}]}))
+    assert "crispness of 000001 is not known" in lidarflow.ok("eval", "run", "--truth", "truth")
+    provenance.write(run, provenance.RunSource(None, (0, 1, 2)))
+    assert "the next scan is not at hand" in lidarflow.ok("eval", "run", "--truth", "truth")
 
 
 def test_a_flow_file_is_scored_against_a_truth_file(lidarflow, data, run, tmp_path):
@@ -223,6 +240,19 @@ def test_data_of_another_run(lidarflow, run, tmp_path):
     synthetic.write_kitti(tmp_path / "cut", [first, (Scan(scan.points[1:]), cut), last])
     said = lidarflow.complaint("eval", "run", "--data", "cut")
     assert f"{len(scan)} points, but scan 000001 of kitti 00 has {len(scan) - 1}; is this the data" in said
+
+
+def test_another_scan_in_the_place_of_the_last(lidarflow, data, run):
+    lidarflow.ok("eval", "run")
+    scans = data / "sequences" / "00" / "velodyne"
+    (scans / "000002.bin").unlink()
+    write_bin(scans / "000003.bin", drive()[2][0].points + [1.0, 0, 0])
+    said = lidarflow.complaint("eval", "run")
+    assert "scan 000003 is not the one that the flow of 000001 leads to: crispness before any motion" in said
+    assert "as in run/metrics.json; is this the data of the run?" in said
+    assert lidarflow.complaint("eval", "run", "--truth", truth_folder(data)) == said
+    (run / "metrics.json").unlink()
+    lidarflow.ok("eval", "run", "--truth", truth_folder(data))
 
 
 def test_what_is_no_run(lidarflow, data, run):
