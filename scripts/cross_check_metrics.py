@@ -101,11 +101,10 @@ def of_av2(pairs: list[Pair]) -> dict[str, float]:
         for name, kind in kinds.items():
             whole[name].append(av2_eval.compute_scene_flow_metrics(
                 result.flow[known], truth.flow[known], kind).mean())
-        moves = np.linalg.norm(truth.residual_flow(points), axis=1) >= 0.05
         found = av2_eval.compute_metrics(
-            result.flow, result.is_dynamic, truth.flow, np.where(truth.is_foreground, A_CLASS, 0), moves,
-            (np.abs(points[:, :2]) <= 35).all(axis=1), known & metrics.evaluated(points, truth.is_ground),
-            FOREGROUND_BACKGROUND_BREAKDOWN)
+            result.flow, result.is_dynamic, truth.flow, np.where(truth.is_foreground, A_CLASS, 0),
+            truth.is_dynamic, (np.abs(points[:, :2]) <= 35).all(axis=1),
+            known & metrics.evaluated(points, truth.is_ground), FOREGROUND_BACKGROUND_BREAKDOWN)
         columns["Example"] += [str(number)] * len(found["Class"])
         for name, values in found.items():
             columns[name] += values

@@ -68,6 +68,9 @@ def test_without_movers_their_scores_are_nan_and_the_rest_stays():
     scores = metrics.score(points, result, replace(truth, is_dynamic=np.zeros(8, bool)))
     assert scores.dynamic.points == 0 and np.isnan(scores.dynamic.mean) and np.isnan(scores.dynamic.median)
     assert np.isnan(scores.movers_found) and scores.static.points == 6
+    three_way = scores.three_way
+    assert (three_way.foreground_dynamic.points, three_way.foreground_static.points) == (0, 2)
+    assert (three_way.missed_movers, three_way.false_movers) == (0, 2), "the flow has a length, labels decide"
 
 
 def test_a_truth_that_knows_nothing_gives_nan_everywhere():

@@ -56,7 +56,8 @@ class Scores:
 def score(points: np.ndarray, result: FlowResult, truth: Truth) -> Scores:
     """Errors of `result` for the source scan's points (N, 3), over finite rows the truth is valid for.
 
-    Three-way and bucketed errors leave ground out, as both leaderboards do.
+    What moves is what the truth says does, but in the bucketed error and in that by speed, which go by the
+    length of the true residual flow. Three-way and bucketed errors leave ground out, as both leaderboards do.
     """
     known = truth.valid & np.isfinite(result.flow).all(axis=1)
     moving, still = known & truth.is_dynamic, known & ~truth.is_dynamic
@@ -77,7 +78,7 @@ def score(points: np.ndarray, result: FlowResult, truth: Truth) -> Scores:
         accuracy_all=accuracy(result.flow[known], truth.flow[known]),
         accuracy_static=accuracy(result.flow[still], truth.flow[still]),
         accuracy_dynamic=accuracy(result.flow[moving], truth.flow[moving]),
-        three_way=three_way(error[counted], residual[counted], truth.is_foreground[counted],
+        three_way=three_way(error[counted], truth.is_dynamic[counted], truth.is_foreground[counted],
                             result.is_dynamic[counted]),
         buckets=None if truth.category is None else buckets(
             points[above], error[above], residual[above], truth.category[above]),
