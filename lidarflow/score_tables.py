@@ -69,7 +69,7 @@ def error_table(scores: Sequence[Scores]) -> Table:
 
 def three_way_table(found: ThreeWay) -> Table:
     """Three-way error and dynamic IoU."""
-    table = _table("three-way error, |x|, |y| ≤ 50 m", "points", "[m]")
+    table = _table("three-way error, points of all pairs, |x|, |y| ≤ 50 m", "points", "[m]")
     for title, part in (("foreground dynamic", found.foreground_dynamic),
                         ("foreground static", found.foreground_static),
                         ("background static", found.background_static)):
@@ -82,7 +82,7 @@ def three_way_table(found: ThreeWay) -> Table:
 
 def class_table(found: Bucketed) -> Table:
     """Bucketed errors of the classes that occur."""
-    table = _table("bucketed error, |x|, |y| < 35 m", "static [m]", "moving, of speed")
+    table = _table("bucketed error, points of all pairs, |x|, |y| < 35 m", "static [m]", "moving, of speed")
     for name, errors in found.classes.items():
         if not (np.isnan(errors.static_m) and np.isnan(errors.dynamic)):
             table.add_row(name.lower().replace("_", " "), _number(errors.static_m), _number(errors.dynamic))

@@ -106,6 +106,26 @@ def test_the_page_holds_the_figures(lidarflow, run, made):
     assert not rests(run.parent)
 
 
+def test_means_over_pairs_are_told_from_figures_of_all_points(lidarflow, run):
+    found = json.loads((run / "metrics.json").read_text())
+    found["mean"] |= {"bucketed_static_m": 0.111, "bucketed_dynamic": 0.222, "epe_three_way_m": 0.333,
+                      "dynamic_iou": 0.444}
+    found["std"] |= dict.fromkeys(("bucketed_static_m", "bucketed_dynamic", "epe_three_way_m"), 0.0)
+    errors = {"static_m": 0.555, "dynamic": 0.666}
+    found["bucketed"] = {"mean": errors, "classes": {"CAR": errors}}
+    io.write_json(run / "metrics.json", found)
+    read = Reader(page_of(lidarflow, run))
+    of_a_pair = {row[0]: row[1] for row in read.rows if len(row) == 2 and " of a pair" in row[0]}
+    assert of_a_pair == {
+        "bucketed error of a pair, static [m]": "0.111 ± 0.000",
+        "bucketed error of a pair, moving, of speed": "0.222 ± 0.000",
+        "three-way error of a pair [m]": "0.333 ± 0.000", "dynamic IoU of a pair": "0.444 ± 0.000"}
+    whole = read.rows.index(["bucketed error, points of all pairs, |x|, |y| < 35 m", "static [m]",
+                             "moving, of speed"])
+    assert read.rows[whole + 1] == ["car", "0.555", "0.666"]
+    assert read.row("three-way error, points of all pairs, |x|, |y| ≤ 50 m") == ["points", "[m]"]
+
+
 def test_changed_settings_stand_out(lidarflow, run):
     read = Reader(page_of(lidarflow, run))
     assert read.row("crispness.sigma_m")[:2] == ["0.3", "0.2"]

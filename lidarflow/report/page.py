@@ -21,17 +21,18 @@ _MOST_PAIR_ROWS, _MOST_OBJECT_ROWS = 60, 25
 _LOW, _HIGH = -1, 1
 _OF_WHOLE_GRAPH = {"t_e_m", "r_e_rad"}
 _OF_MOVERS = {"dynamic_iou", "false_movers"}
-# name in metrics.json: (what people call it, factor, digits, which way is better)
+# name in metrics.json: (what people call it, factor, digits, which way is better). All are means of the
+# figures of pairs; "of a pair" tells them from what other tables have of the points of all pairs.
 _FIGURES = {
     "epe_all_m": ("end-point error, all [m]", 1.0, 3, _LOW),
     "epe_static_m": ("end-point error, static [m]", 1.0, 3, _LOW),
     "epe_dynamic_m": ("end-point error, moving [m]", 1.0, 3, _LOW),
     "epe_dynamic_median_m": ("end-point error, moving, median [m]", 1.0, 3, _LOW),
     "dynamic_error_over_speed": ("error over speed, moving", 1.0, 3, _LOW),
-    "epe_three_way_m": ("three-way end-point error [m]", 1.0, 3, _LOW),
-    "bucketed_static_m": ("bucketed error, static [m]", 1.0, 3, _LOW),
-    "bucketed_dynamic": ("bucketed error, moving, of speed", 1.0, 3, _LOW),
-    "dynamic_iou": ("dynamic IoU", 1.0, 3, _HIGH),
+    "epe_three_way_m": ("three-way error of a pair [m]", 1.0, 3, _LOW),
+    "bucketed_static_m": ("bucketed error of a pair, static [m]", 1.0, 3, _LOW),
+    "bucketed_dynamic": ("bucketed error of a pair, moving, of speed", 1.0, 3, _LOW),
+    "dynamic_iou": ("dynamic IoU of a pair", 1.0, 3, _HIGH),
     "movers_found": ("moving points found [%]", 100.0, 2, _HIGH),
     "false_movers": ("static points called moving [%]", 100.0, 2, _LOW),
     "strict_accuracy": ("strict accuracy [%]", 100.0, 2, _HIGH),
