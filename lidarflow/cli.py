@@ -13,13 +13,14 @@ from typing import Annotated
 import typer
 
 from lidarflow import __version__
-from lidarflow.errors import LidarflowError
+from lidarflow.errors import DataError, LidarflowError
 from lidarflow.eval_cli import evaluate
 from lidarflow.export_cli import export
 from lidarflow.rgbd_cli import app as rgbd_app
-from lidarflow.run_cli import Spread, open_data, pairs_done, process
+from lidarflow.run_cli import Spread, open_data, pairs_done, process, say_what_is_idle
 from lidarflow.terminal import Resume
 from lidarflow.terminal import announce_first_use as _announce_first_use
+from lidarflow.terminal import check_arrows as _check_arrows
 from lidarflow.terminal import check_exists as _check_exists
 from lidarflow.terminal import check_live_view as _check_live_view
 from lidarflow.terminal import check_words as _check_words
@@ -129,6 +130,7 @@ def pair(
                                  ("--picture", picture, ".png")):
         if file is not None:
             io.check_output(option, file, suffix, inputs=(source, target))
+    _check_arrows(arrows, visualize or recording is not None, "give --recording FILE.rrd or --visualize")
     _check_live_view(visualize)
     correction = settings.preparation.kitti_correction
     scans = ScanPair(datasets.read_scan(source, correction), datasets.read_scan(target, correction))
@@ -147,6 +149,7 @@ def pair(
     _print(pair_table(scans, result, alignment))
     print(f"assumed    {_assumed(source, target, correction)}")
     print(f"method     {method}")
+    say_what_is_idle((method,), settings, along=False)
     print(f"flow       {out}")
     print(f"look at it with: lidarflow view {out} --target {target}")
 
@@ -183,8 +186,10 @@ def run(
 
     settings = load(config, _with_solver(overrides, solver))
     methods.find(method)
+    _check_arrows(arrows, visualize or record, "leave --no-record out, or give --visualize")
     dataset = open_data(data, dataloader, sequence, settings)
     print(f"method     {method}")
+    say_what_is_idle((method,), settings)
     process(dataset, settings, out, Viewing(record, visualize, arrows), jump, n_scans, method,
              Going(resume, skip_bad), Spread.wanted(workers, scheduler, chunk))
 
@@ -212,6 +217,7 @@ def compare(
     if out is not None:
         io.check_output("--out", out, ".json", inputs=(data,))
     dataset = open_data(data, dataloader, sequence, settings)
+    say_what_is_idle(chosen, settings)
     frames = runner.choose_frames(dataset, jump, n_scans)
     with pairs_done(len(frames) - 1) as on_pair:
         found = comparing.compare(dataset, frames, chosen, settings, on_pair)
@@ -262,6 +268,8 @@ def view(
     if save is not None:
         io.check_output("--save", save, ".rrd", inputs=(what,))
     if what.is_dir() or what.suffix == ".rrd":
+        if target is not None:
+            raise DataError(f"--target {target}: is for a flow file; {what} holds its clouds already")
         recording = run_folder.find_recording(what)
         viewer.check_recording(recording)
         if save is None:
@@ -358,7 +366,6 @@ def _assumed(source: Path, target: Path, kitti_correction: str) -> str:
 
 def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:
     from lidarflow import io, rgbd_io, rgbd_viewer, viewer
-    from lidarflow.errors import DataError
 
     if target is not None:
         raise DataError(f"--target {target}: {file} is of RGB-D images, which need no target to be shown")

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from lidarflow.errors import DataError
 from lidarflow.terminal import check_exists, show, working
 
 
@@ -23,6 +24,8 @@ def evaluate(
     check_exists(what, "a run folder or a flow file (.npz)")
     if out is not None:
         io.check_output("--out", out, ".json", inputs=(what,))
+    if data is not None and not what.is_dir():
+        raise DataError(f"--data {data}: is for a run folder; the flow file {what} needs --truth alone")
     with working(f"scores of {what}"):
         if what.is_dir():
             done = evaluation.evaluate_run(what, truth, data)

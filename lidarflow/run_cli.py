@@ -9,6 +9,8 @@ from lidarflow.errors import ConfigError
 from lidarflow.terminal import announce_first_use, check_live_view, progress, show
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from lidarflow.config import Config
     from lidarflow.datasets import Dataset
     from lidarflow.runner import Going, Viewing
@@ -48,6 +50,14 @@ def open_data(data: Path, dataloader: str | None, sequence: str | None, settings
     if dataset.note:
         print(f"note       {dataset.note}")
     return dataset
+
+
+def say_what_is_idle(names: "Sequence[str]", settings: "Config", along: bool = True) -> None:
+    """A note on settings without an effect on methods of these names."""
+    from lidarflow import methods
+
+    for line in methods.without_effect(names, settings, along):
+        print(f"note       {line}")
 
 
 @contextlib.contextmanager

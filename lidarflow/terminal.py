@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from lidarflow.errors import DataError
+from lidarflow.errors import ConfigError, DataError
 
 Resume = Annotated[bool, typer.Option(
     "--resume", help="Go on with a run that was interrupted; the results are the same.")]
@@ -59,6 +59,12 @@ def check_exists(what: Path, expected: str) -> None:
     """DataError, which says what is `expected`, where there is nothing at `what`."""
     if not what.exists():
         raise DataError(f"{what}: no such file or folder; expected {expected}")
+
+
+def check_arrows(wanted: bool, shown: bool, instead: str) -> None:
+    """ConfigError where arrows are wanted and nothing is shown or recorded; `instead` is what to ask for."""
+    if wanted and not shown:
+        raise ConfigError(f"--arrows: nothing is shown or recorded that could have them; {instead}")
 
 
 def announce_first_use() -> None:

@@ -11,7 +11,7 @@ from shared_data import SHARED, needs_shared
 
 from lidarflow import baselines, methods, pose, synthetic
 from lidarflow.baselines import ransac
-from lidarflow.config import Config, EgoConfig
+from lidarflow.config import Config, EgoConfig, load, to_dict, updated
 from lidarflow.datasets import open_dataset
 from lidarflow.errors import ConfigError, DataError
 from lidarflow.lidar import ego, features, matching
@@ -47,6 +47,38 @@ def off(found: np.ndarray, known: np.ndarray) -> tuple[float, float]:
     """Metres and degrees between two motions."""
     return (float(pose.translation_distance(found, known)),
             float(np.degrees(pose.rotation_distance(found, known))))
+
+
+# --- what they ask for ---
+
+@pytest.mark.parametrize("name", NAMES)
+def test_settings_that_are_said_to_have_no_effect_have_none(room, answers, name):
+    other = load(overrides=(
+        "normals.radius_m=0.4", "mesh.max_edge_m=0.2", "shot.radius_m=0.7", "matching.max_ratio=0.5",
+        "graph.start=ego", "solver.method=gtsam", "refine.rounds=0", "ego.method=kiss_icp",
+        "ego.refine=false", "ego.voxel_m=0.4", "dynamic.min_speed_m_per_s=2.0", "objects.enabled=false"))
+    (line,) = methods.without_effect((name,), other)
+    keys, reason = line.split(": no effect with ")
+    assert reason == f"--method {name}" and "solver.method" in keys
+    used, idle = to_dict(Config()), to_dict(other)
+    for key in keys.split(", "):
+        section, _, setting = key.partition(".")
+        used[section][setting] = idle[section][setting]
+    found = methods.find(name).estimate(room[0], updated(Config(), used))
+    assert_array_equal(found.flow, answers[name].flow)
+
+
+def test_settings_that_another_switches_off_are_said_to_have_no_effect():
+    def idle(*overrides, along=True):
+        return methods.without_effect((methods.OURS,), load(overrides=overrides), along)
+
+    assert idle("mesh.max_edge_m=0.2", "objects.near_m=0.1", "refine.rounds=0", "ego.method=kiss_icp") == []
+    assert idle("ego.method=kiss_icp", along=False) == ["ego.method: no effect with a single pair"]
+    assert idle("dynamic.min_gain_m=0.1") == ["dynamic.min_gain_m: no effect with objects.enabled = true"]
+    assert idle("objects.enabled=false", "objects.near_m=0.1", "solver.tie_weight=3.0",
+                "dynamic.min_gain_m=0.1", "refine.rounds=0", "refine.reach_m=0.2") == [
+        "solver.tie_weight, objects.near_m: no effect with objects.enabled = false",
+        "refine.reach_m: no effect with refine.rounds = 0"]
 
 
 # --- what they find ---

@@ -130,6 +130,25 @@ def test_the_module_is_the_command_line(scans):
     assert done.stdout.startswith("lidarflow ")
 
 
+def test_what_has_no_effect_is_said(lidarflow, scans, tmp_path):
+    pair = "pair", *scans[:2], "--out", tmp_path / "flow.npz"
+    told = lidarflow.ok(*pair, "--method", "icp", "--solver", "gtsam", *OFF)
+    assert "note       solver.method: no effect with --method icp\n" in told
+    assert "no effect" not in lidarflow.ok(*pair, "--method", "icp", *OFF)
+    told = lidarflow.ok("run", scans[0].parent, "--out", tmp_path / "run", "--method", "zero", "--no-record",
+                        "--set", "ego.refine=false")
+    assert "note       ego.refine: no effect with --method zero\n" in told
+    told = lidarflow.ok("compare", scans[0].parent, "--methods", "zero,ego", "--set", "ego.voxel_m=0.3",
+                        "--set", "ego.refine=false", "--set", "mesh.max_edge_m=0.3")
+    assert [line for line in told.splitlines() if "no effect" in line] == [
+        "note       mesh.max_edge_m: no effect with --method zero, ego",
+        "note       ego.refine: no effect with ego.method = registration"]
+    said = lidarflow.complaint(*pair, "--arrows")
+    assert said.startswith("--arrows: nothing is shown or recorded") and "give --recording FILE.rrd" in said
+    said = lidarflow.complaint("run", scans[0].parent, "--out", tmp_path / "a", "--arrows", "--no-record")
+    assert "leave --no-record out" in said and not (tmp_path / "a").exists()
+
+
 def test_pair_finds_the_ego_motion(lidarflow, scans, tmp_path):
     lidarflow.ok("pair", *scans[:2], "--out", tmp_path / "flow.npz", *OFF)
     found, truth = io.load_flow(tmp_path / "flow.npz"), drive()[0][1]
@@ -370,6 +389,8 @@ def test_view_opens_what_it_is_given(lidarflow, finished, monkeypatch):
     for what in (finished[0], finished[0] / "recording.rrd", finished[0] / "flow" / "000001.npz"):
         lidarflow.ok("view", what)
     assert opened == [("recording.rrd", True), ("recording.rrd", True), ("flow.rrd", True)]
+    said = lidarflow.complaint("view", finished[0], "--target", "scan.bin")
+    assert said.startswith("--target scan.bin: is for a flow file")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux sessions can lack a display")

@@ -116,6 +116,8 @@ def test_a_flow_file_is_scored_against_a_truth_file(lidarflow, data, run, tmp_pa
     found = metrics_of(tmp_path, "m.json")
     assert found["mean"]["epe_static_m"] == pytest.approx(OFF_M, rel=1e-3) and found["truth"] == "flow"
     assert "metrics    m.json" in out and "metrics" not in lidarflow.ok("eval", file, "--truth", truth)
+    said = lidarflow.complaint("eval", file, "--truth", truth, "--data", data)
+    assert said.startswith(f"--data {data}: is for a run folder; the flow file {file} needs")
 
 
 def test_poses_alone_make_a_static_scene(lidarflow, data, run):
