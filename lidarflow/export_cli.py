@@ -1,4 +1,4 @@
-"""The command `lidarflow export`: with cli.py it prints."""
+"""The command `lidarflow export`, for cli.py."""
 
 from pathlib import Path
 from typing import Annotated

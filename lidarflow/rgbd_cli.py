@@ -1,4 +1,4 @@
-"""The commands `lidarflow rgbd …`: with cli.py the only place that prints.
+"""The commands `lidarflow rgbd …`, for cli.py.
 
 Heavy packages are imported inside the commands, so that --help answers at once.
 """

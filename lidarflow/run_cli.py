@@ -1,4 +1,4 @@
-"""What `lidarflow run` and `lidarflow demo` do and say; with cli.py and rgbd_cli.py all that prints."""
+"""What `lidarflow run` and `lidarflow demo` do and say, for cli.py."""
 
 import contextlib
 from dataclasses import dataclass, replace
