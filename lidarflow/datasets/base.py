@@ -14,7 +14,7 @@ from lidarflow.datasets.kitti_correction import correct_vertical_angle
 from lidarflow.errors import DataError
 from lidarflow.types import Scan, Truth
 
-DEFAULT_PERIOD_NS = 100_000_000
+_PERIOD_NS = 100_000_000     # of 10 Hz
 _EARLIEST_S, _LATEST_S = 10**8, 9 * 10**9     # what a stamp may be; 64-bit nanoseconds end at 9.2e9 s
 TRUTH_ARRAYS = ("flow", "valid", "dynamic", "track", "target_from_source")
 
@@ -72,7 +72,7 @@ class ScanFiles:
         self.files = list(files)
         clouds.check_names(self.files)
         known_ns = list(times_ns) if times_ns is not None else times_from_names(self.files)
-        self.times_ns = known_ns or [index * DEFAULT_PERIOD_NS for index in range(len(self.files))]
+        self.times_ns = known_ns or assumed_times(len(self.files))
         self.correct = correct
         assumed = ["KITTI vertical-angle correction on"] if correct else []
         assumed += [] if known_ns else ["10 Hz assumed"]
@@ -122,6 +122,11 @@ def frame_number(file: Path) -> int | None:
     """The number that a file's stem ends in, e.g. 12 of scan00012.png."""
     digits = re.search(r"\d+$", file.stem)
     return int(digits.group()) if digits else None
+
+
+def assumed_times(count: int) -> list[int]:
+    """Times in ns of `count` scans of which none is known: 10 Hz, from 0 on."""
+    return [index * _PERIOD_NS for index in range(count)]
 
 
 def times_from_names(files: Sequence[Path]) -> list[int]:

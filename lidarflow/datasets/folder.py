@@ -79,7 +79,6 @@ class KittiRaw(ScanFiles):
         """Given poses (N, 4, 4), where a file beside the scan folder holds them."""
         return self._poses
 
-
     def labels(self) -> Labels | None:
         """The drive's labelled boxes, where a file holds them."""
         for name, read in (("tracklet_labels.xml", read_tracklets), ("boxes.csv", read_table)):

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.datasets import point_cloud2
-from lidarflow.datasets.base import DEFAULT_PERIOD_NS, Source, check_index
+from lidarflow.datasets.base import Source, assumed_times, check_index
 from lidarflow.datasets.foreign import Stream, guarded
 from lidarflow.datasets.kitti_correction import correct_vertical_angle, is_wanted
 from lidarflow.errors import DataError
@@ -46,7 +46,7 @@ class KissLoader:
         if not self._length:
             raise DataError(f"{self._origin} found no scans; is this the right folder for it?")
         self._poses = _checked_poses(vars(self._data).get("gt_poses"), self._length)
-        self._times_ns = [index * DEFAULT_PERIOD_NS for index in range(self._length)]
+        self._times_ns = assumed_times(self._length)
         self._stream = None
         if loader == "nuscenes":
             self._times_ns = guarded(self._origin, lambda: _nuscenes_times(self._data))
