@@ -83,8 +83,7 @@ def _write_pair(folder: RgbdFolder, step: Step, plan: Plan, out: Path, stream, w
     begin, pair, result = time.perf_counter(), step.pair, step.result
     report = report_pair(pair, result, folder.truth(step.index), folder.world_from_camera(), step.index)
     file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
-    # A checkpoint is younger than its flow file, which may have been cut off since.
-    if not (step.restored and io.is_whole(file)):
+    if not step.is_written(file):
         rgbd_io.save_flow(file, pair.source, result, plan.config, stats_of(plan.method, report))
     world_from_source = way.add(step.index, pair, result.odometry)
     if stream is not None:

@@ -209,11 +209,8 @@ def _write_pair(
     begin, pair, result = time.perf_counter(), step.pair, step.result
     file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
     with Aside() as beside:
-        # A checkpoint is younger than its flow file, which may have been cut off since.
-        if not (step.restored and io.is_whole(file)):
-            saved = beside.begin(io.save_flow, file, pair.source.points, result, config)
-        else:
-            saved = there(None)
+        saved = there(None) if step.is_written(file) else beside.begin(
+            io.save_flow, file, pair.source.points, result, config)
         report = report_pair(dataset, step.index, pair, result, config)
         saved.result()
     world_from_source = way.add(step.index, pair, result.ego_motion)

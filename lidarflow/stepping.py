@@ -40,6 +40,10 @@ class Step:
     stretch: Stretch
     restored: bool
 
+    def is_written(self, file: Path) -> bool:
+        """Whether its flow file is whole: older than a checkpoint, it may have been cut off since."""
+        return self.restored and io.is_whole(file)
+
 
 class Kept(Protocol):
     """Checkpoints: of which pairs there are, the stretch and the answer of one, and the tracks after it."""
