@@ -147,23 +147,19 @@ def show_config() -> None:
 def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Path, viewing: "Viewing",
              jump: int = 0, n_frames: int | None = None, going: "Going | None" = None) -> None:
     """Run over a folder and say what was found."""
-    from lidarflow import rgbd_runner, run_folder, runner
-    from lidarflow.resuming import damaged_files
+    from lidarflow import rgbd_runner, runner
     from lidarflow.rgbd_tables import run_notes, run_table
-    from lidarflow.tables import complete_line, replaced_line, skipped_lines, where_results_are
+    from lidarflow.tables import earlier_run, skipped_lines, where_results_are
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(folder, jump, n_frames, "frames")
     skipped: list[Skipped] = []
     going = replace(going or runner.Going(), on_skip=skipped.append)
-    if going.resume and runner.is_complete(folder, frames, settings, out, method, going):
-        damaged = damaged_files(out)
-        print(complete_line(out, damaged))
-        if not damaged:
-            return
-    run_folder.check(out)
-    if not going.resume and run_folder.is_run(out):
-        print(replaced_line(out))
+    said, is_done = earlier_run(folder, frames, settings, out, method, going)
+    if said is not None:
+        print(said)
+    if is_done:
+        return
     announce_first_use()
     with progress("frame pairs", len(frames) - 1) as bar:
 

@@ -73,29 +73,18 @@ def process(
     method: str = "ours", going: "Going | None" = None, spread: Spread | None = None,
 ) -> None:
     """Run over a data set and say what was found."""
-    from lidarflow import run_folder, runner
-    from lidarflow.resuming import damaged_files
-    from lidarflow.tables import (
-        complete_line,
-        replaced_line,
-        run_notes,
-        run_table,
-        skipped_lines,
-        where_results_are,
-    )
+    from lidarflow import runner
+    from lidarflow.tables import earlier_run, run_notes, run_table, skipped_lines, where_results_are
 
     check_live_view(viewing.visualize)
     frames = runner.choose_frames(dataset, jump, n_scans)
     skipped: list[Skipped] = []
     going = replace(going or runner.Going(), on_skip=skipped.append, chunk=spread.chunk if spread else 0)
-    if going.resume and runner.is_complete(dataset, frames, settings, out, method, going):
-        damaged = damaged_files(out)
-        print(complete_line(out, damaged))
-        if not damaged:
-            return
-    run_folder.check(out)
-    if not going.resume and run_folder.is_run(out):
-        print(replaced_line(out))
+    said, is_done = earlier_run(dataset, frames, settings, out, method, going)
+    if said is not None:
+        print(said)
+    if is_done:
+        return
     if spread is not None:
         _compute(dataset, frames, settings, out, method, going, spread)
         going = replace(going, resume=True)

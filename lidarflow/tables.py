@@ -1,18 +1,25 @@
 """Tables for people, from reports; nothing here prints."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich import box
 from rich.table import Table
 
-from lidarflow import pose
+from lidarflow import pose, run_folder
 from lidarflow.compare import Comparison
 from lidarflow.config import Config, describe
 from lidarflow.metrics import Alignment
-from lidarflow.runner import NO_TRUTH, PairReport, figures_of, mean_of, truth_of
+from lidarflow.resuming import damaged_files
+from lidarflow.runner import NO_TRUTH, Going, PairReport, figures_of, is_complete, mean_of, truth_of
 from lidarflow.stepping import Skipped
 from lidarflow.types import FlowResult, ScanPair
+
+if TYPE_CHECKING:
+    from lidarflow.datasets import Dataset
+    from lidarflow.datasets.rgbd_folders import RgbdFolder
+    from lidarflow.rgbd_config import RgbdConfig
 
 _COLUMNS = {
     "epe_static_m": "EPE\nstatic\n[m]", "epe_dynamic_m": "EPE\nmoving\n[m]",
@@ -162,17 +169,29 @@ def skipped_lines(skipped: list[Skipped], count: int, pairs: int, what: str = "s
             f"skipped    {len(skipped)} of {count} {what}s; {pairs} pairs are left\n"]
 
 
-def complete_line(out: Path, damaged: list[str]) -> str:
+def earlier_run(
+    data: "Dataset | RgbdFolder", frames: list[int], config: "Config | RgbdConfig", out: Path, method: str,
+    going: Going,
+) -> tuple[str | None, bool]:
+    """What is said of an earlier run in `out`, None where there is none, and whether nothing is left to do.
+
+    Raises DataError for a folder that the run may not fill, or not go on with.
+    """
+    if going.resume and is_complete(data, frames, config, out, method, going):
+        damaged = damaged_files(out)
+        return _complete_line(out, damaged), not damaged
+    run_folder.check(out)
+    if going.resume or not run_folder.is_run(out):
+        return None, False
+    return f"replacing  {out}: holds an earlier run, which the results of this one replace", False
+
+
+def _complete_line(out: Path, damaged: list[str]) -> str:
     """What is said of a run that was complete, and of its files that are `damaged` by now."""
     if not damaged:
         return f"complete   {out}: nothing is left to do"
     others = f" and {len(damaged) - 1} more files are" if damaged[1:] else " is"
     return f"damaged    {out}: {damaged[0]}{others} missing or cut off; all pairs are computed anew"
-
-
-def replaced_line(out: Path) -> str:
-    """What is said where `out` holds an earlier run that is not gone on with."""
-    return f"replacing  {out}: holds an earlier run, which the results of this one replace"
 
 
 def where_results_are(out: Path, is_recorded: bool) -> list[str]:
