@@ -18,7 +18,7 @@ from lidarflow.eval_cli import evaluate
 from lidarflow.export_cli import export
 from lidarflow.rgbd_cli import app as rgbd_app
 from lidarflow.run_cli import Spread, open_data, pairs_done, process, say_what_is_idle
-from lidarflow.terminal import Resume
+from lidarflow.terminal import ConfigFile, Resume, Visualize
 from lidarflow.terminal import announce_first_use as _announce_first_use
 from lidarflow.terminal import check_arrows as _check_arrows
 from lidarflow.terminal import check_exists as _check_exists
@@ -35,8 +35,6 @@ app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(rgbd_app, name="rgbd")
 
-ConfigFile = Annotated[
-    Path | None, typer.Option("--config", help="TOML file with differences from the defaults.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, e.g. mesh.max_edge_m=0.5.")]
@@ -51,7 +49,6 @@ MethodName = Annotated[
     str, typer.Option("--method", help="ours, or a baseline: zero, ego, icp, ransac_icp.")]
 Solver = Annotated[
     str | None, typer.Option("--solver", help="fast or gtsam, short for --set solver.method=NAME.")]
-Visualize = Annotated[bool, typer.Option("--visualize", help="Open the viewer, show results as they come.")]
 Arrows = Annotated[bool, typer.Option("--arrows", help="Also record the total flow as arrows.")]
 
 

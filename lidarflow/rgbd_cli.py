@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidarflow.terminal import Resume, announce_first_use, check_live_view, progress, show, working
+from lidarflow.terminal import (
+    ConfigFile,
+    Resume,
+    Visualize,
+    announce_first_use,
+    check_live_view,
+    progress,
+    show,
+    working,
+)
 
 if TYPE_CHECKING:
     from lidarflow.datasets.rgbd_folders import RgbdFolder
@@ -27,9 +36,6 @@ CameraFile = Annotated[Path | None, typer.Option(
 Intrinsics = Annotated[tuple[float, float, float, float] | None, typer.Option(
     metavar="FX FY CX CY", help="The camera in pixels instead of --camera.")]
 Method = Annotated[str, typer.Option(help="ours, or open3d: Open3D's RGB-D odometry.")]
-Visualize = Annotated[bool, typer.Option("--visualize", help="Open the viewer, show results as they come.")]
-ConfigFile = Annotated[
-    Path | None, typer.Option("--config", help="TOML file with differences from the defaults.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, e.g. clusters.count=24.")]

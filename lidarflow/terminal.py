@@ -1,4 +1,4 @@
-"""What all commands of the command line share: the console, a spinner, and the check for a viewer."""
+"""What all commands of the command line share: options, the console, a spinner, the check for a viewer."""
 
 import itertools
 import re
@@ -10,6 +10,9 @@ import typer
 
 from lidarflow.errors import ConfigError, DataError
 
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="TOML file with differences from the defaults.")]
+Visualize = Annotated[bool, typer.Option("--visualize", help="Open the viewer, show results as they come.")]
 Resume = Annotated[bool, typer.Option(
     "--resume", help="Go on with a run that was interrupted; the results are the same.")]
 
