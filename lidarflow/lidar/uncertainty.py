@@ -96,8 +96,8 @@ def _std(
 def of_matches(problem: FlowProblem, motions: np.ndarray, truncation_m: float) -> np.ndarray:
     """Standard deviation (M,) in metres of solved variables, from the matches around each of them.
 
-    It is how far the nearest inliers of the component are off, over the root of how many of them lie within
-    the reach of one: matches nearer to each other than that err together. NaN without an inlier.
+    It is how far the nearest inliers of the component are off, over the root of how many independent ones
+    there are: those within reach, times the square of spacing over reach, at least 1. NaN without an inlier.
     """
     at, target = problem.points[problem.match_index], problem.match_target
     off_m = lengths(pose.apply(motions[problem.match_index], at) - target)

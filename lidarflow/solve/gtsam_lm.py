@@ -4,6 +4,7 @@ Every variable sits at its own point, X_i = τ_i · Trans(p_i), so that gtsam's 
 needed: a translation prior for a match, a between factor for two mesh neighbours.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import gtsam
@@ -50,7 +51,12 @@ def solve(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Component:
-    """The part of a FlowProblem that belongs to one mesh component, with local indices."""
+    """The part of a FlowProblem that belongs to one mesh component, indices but `rows` within it.
+
+    rows  (M,)         its variables in the problem
+    tied  (T,)         the variables that have a group, and
+    tie   (T, 4, 4)    the motions of their groups
+    """
 
     rows: np.ndarray
     points: np.ndarray
@@ -62,8 +68,8 @@ class _Component:
     tie: np.ndarray
 
 
-def _components(problem: FlowProblem):
-    """The components of a problem that have matches, as `_Component`s in ascending order."""
+def _components(problem: FlowProblem) -> Iterator[_Component]:
+    """The components of a problem that have matches, in ascending order."""
     count = int(problem.component.max()) + 1 if len(problem.component) else 0
     local = np.empty(len(problem.points), np.int64)
     rows_of = _grouped(problem.component, count)
