@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from lidarflow import pose
+from lidarflow import pose, robust
 from lidarflow.kernels import (
     directions,
     grid,
@@ -281,12 +281,12 @@ def plane_step_twin(points, normals, centre, turn, shift, target, target_normals
     for i in paired:
         x, off = moved[i] - centre - shift, target[row[i]] - moved[i]
         jacobian = np.column_stack([np.cross(UP, x), np.eye(3)])
-        weight = 0.05 / (1.0 + off @ off / 0.15**2) ** 2
+        weight = 0.05 * robust.geman_mcclure(off @ off, 0.15)[1]
         rows += list(np.sqrt(weight) * jacobian)
         rights += list(np.sqrt(weight) * off)
         total += weight
         if agrees[i]:
-            weight = 1.0 / (1.0 + offset_m[i] ** 2 / 0.05**2) ** 2
+            _, weight = robust.geman_mcclure(offset_m[i] ** 2, 0.05)
             rows.append(np.sqrt(weight) * target_normals[row[i]] @ jacobian)
             rights.append(np.sqrt(weight) * offset_m[i])
             total += weight
