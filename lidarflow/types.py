@@ -204,14 +204,14 @@ class FlowProblem:
         if np.bincount(self.match_index).max(initial=0) > 1:
             raise ValueError("FlowProblem.match_index: a variable has more than one match")
 
-    def part(self, rows: np.ndarray) -> "FlowProblem":
-        """The problem of some variables, ascending rows (R,), which are whole components."""
+    def part(self, rows: np.ndarray, initial: np.ndarray) -> "FlowProblem":
+        """The problem of some variables, ascending rows (R,) of whole components, from starts (R, 4, 4)."""
         kept = np.zeros(len(self.points), bool)
         kept[rows] = True
         position = (np.cumsum(kept) - 1).astype(np.int32)
         matched = kept[self.match_index]
         return replace(
-            self, points=self.points.take(rows, axis=0), initial=self.initial.take(rows, axis=0),
+            self, points=self.points.take(rows, axis=0), initial=initial,
             match_index=position[self.match_index[matched]], match_target=self.match_target[matched],
             edges=position.take(self.edges.compress(kept.take(self.edges[:, 0]), axis=0)),
             component=without_gaps(self.component[rows]),

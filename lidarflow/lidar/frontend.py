@@ -108,8 +108,8 @@ def tied(
     """The `kept` variables (M,) of a graph, whole components, each tied to its object or the world."""
     motions = np.concatenate([ego_motion[None], object_motions])
     group = (owners(graph, object_id)[kept] + 1).astype(np.int32)   # group 0 is the static world
-    part = graph.problem.part(np.flatnonzero(kept))
-    reduced = replace(part, initial=motions.take(group, axis=0), group=group, group_motions=motions)
+    part = graph.problem.part(np.flatnonzero(kept), motions.take(group, axis=0))
+    reduced = replace(part, group=group, group_motions=motions)
     position = np.full(len(kept) + 1, -1, np.int32)      # the last is that of points without a variable
     position[:-1][kept] = np.arange(len(reduced.points))
     return Graph(reduced, position.take(graph.variable), graph.rows[kept])

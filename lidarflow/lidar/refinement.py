@@ -79,9 +79,9 @@ def refined(
     for _ in range(config.rounds):
         if len(rows) == 0:
             break
-        part = problem if len(rows) == len(problem.points) else problem.part(rows)
-        motions[rows], solved[rows], *_ = solve(
-            rematched(part, motions[rows], surface, config.reach_m), settings)
+        here = motions[rows]
+        part = problem if len(rows) == len(problem.points) else problem.part(rows, here)
+        motions[rows], solved[rows], *_ = solve(rematched(part, here, surface, config.reach_m), settings)
         by_group = pose.apply(part.group_motions[part.group], part.points)
         apart_m = lengths(pose.apply(motions[rows], part.points) - by_group)
         limbs = np.unique(part.component[apart_m > config.tie_truncation])
