@@ -21,6 +21,7 @@ _SLOW_SATURATION, _FULL_SATURATION = 0.55, 1.0
 _SLOW_VALUE = 0.85
 _SHADE_BELOW_M, _SHADE_ABOVE_M = -2.0, 2.5
 _CLUSTER_CELL_M = 0.7
+_MIN_POINTS, _MOST_OBJECTS = 10, 40     # of a group that is shown, and groups
 
 
 def motion_colours(residual_flow: np.ndarray, is_dynamic: np.ndarray, dt_s: float,
@@ -55,8 +56,9 @@ def scene_colours(points: np.ndarray, residual_flow: np.ndarray, is_dynamic: np.
     return np.where(is_dynamic[:, None], coloured, static_shade(points))
 
 
-def moving_objects(points: np.ndarray, residual_flow: np.ndarray, is_dynamic: np.ndarray,
-                   min_points: int = 10, max_objects: int = 40) -> tuple[np.ndarray, np.ndarray]:
+def moving_objects(
+    points: np.ndarray, residual_flow: np.ndarray, is_dynamic: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Tops (K, 3) and mean residual flow (K, 3) of groups of moving points, in metres, largest group first.
 
     A top is the middle of a group in the ground plane at the height of its highest point.
@@ -72,7 +74,7 @@ def moving_objects(points: np.ndarray, residual_flow: np.ndarray, is_dynamic: np
     group = ndimage.label(occupied, structure=np.ones((3, 3)))[0][cell[:, 0], cell[:, 1]]
     size = np.bincount(group)
     order = np.argsort(-size, kind="stable")
-    order = order[size[order] >= min_points][:max_objects]
+    order = order[size[order] >= _MIN_POINTS][:_MOST_OBJECTS]
     top = ndimage.maximum(points[:, 2], group, order)
 
     def mean(column: np.ndarray) -> np.ndarray:

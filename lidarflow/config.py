@@ -46,7 +46,6 @@ class GroundConfig:
     max_height_m: float = setting(
         0.25, "points higher than this over the low ground of their cell of 2 m, plus a slope of one in ten, "
         "are not ground", low=0.02)
-
     fill_height_m: float = setting(
         0.12, "points within this height of the ground around them are ground as well", low=0)
 

@@ -49,16 +49,13 @@ def generate(folder: Path, scans: int | None = None) -> Path:
     return _generated(folder, write)
 
 
-def generate_room(folder: Path, frames: int | None = None) -> Path:
-    """Write `frames` RGB-D frames of a room and their truth to `folder`, in TUM's layout; as `generate`.
-
-    `frames` is FRAMES where it is not given.
-    """
+def generate_room(folder: Path) -> Path:
+    """Write RGB-D frames of a room and their truth to `folder`, in TUM's layout; as `generate`."""
     rng = np.random.default_rng(_SEED)
 
     def write(place: Path) -> None:
         sensor = synthetic.RgbdSensor(_ROOM_CAMERA)
-        sequence = synthetic.rgbd_sequence(synthetic.living_room(rng), sensor, frames or FRAMES, rng)
+        sequence = synthetic.rgbd_sequence(synthetic.living_room(rng), sensor, FRAMES, rng)
         synthetic.write_tum(place, sequence, _ROOM_CAMERA)
 
     return _generated(folder, write)

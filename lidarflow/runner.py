@@ -370,7 +370,7 @@ def _object_rows(frame: str, result: FlowResult) -> list[tuple]:
 def _open_recording(path: Path | None, spawn: bool):
     from lidarflow import viewer
 
-    return viewer.open_recording(path, spawn=spawn)
+    return viewer.open_recording(path, spawn)
 
 
 @contextlib.contextmanager

@@ -51,10 +51,9 @@ _VIEWER_START_S = 20.0
 _STALLED_S = 10.0             # a file that has not grown for so long will not grow any more
 
 
-def open_recording(path: Path | None, application_id: str = "lidarflow",
-                   spawn: bool = False) -> rr.RecordingStream:
+def open_recording(path: Path | None, spawn: bool = False) -> rr.RecordingStream:
     """A stream of scans that writes to the file `path`, to a viewer it starts (`spawn`), or to both."""
-    stream = open_stream(path, application_id, spawn, blueprint())
+    stream = open_stream(path, "lidarflow", spawn, blueprint())
     _log_static(stream)
     return stream
 

@@ -26,13 +26,13 @@ def read_list(path: Path) -> tuple[np.ndarray, list[str]]:
     return np.array(times, np.int64)[order], [rows[index][1] for index in order]
 
 
-def associate(first_ns: np.ndarray, second_ns: np.ndarray, limit_ns: int = ASSOCIATION_NS) -> np.ndarray:
+def associate(first_ns: np.ndarray, second_ns: np.ndarray) -> np.ndarray:
     """Rows (K, 2) of two increasing lists of times that belong together, in order of time.
 
-    One to one, the nearest in time first, never more than `limit_ns` apart.
+    One to one, the nearest in time first, never more than ASSOCIATION_NS apart.
     """
-    begin = np.searchsorted(second_ns, first_ns - limit_ns, "left")
-    end = np.searchsorted(second_ns, first_ns + limit_ns, "right")
+    begin = np.searchsorted(second_ns, first_ns - ASSOCIATION_NS, "left")
+    end = np.searchsorted(second_ns, first_ns + ASSOCIATION_NS, "right")
     candidates = np.array([(i, j) for i, (low, high) in enumerate(zip(begin, end, strict=True))
                            for j in range(low, high)], int).reshape(-1, 2)
     apart_ns = np.abs(first_ns[candidates[:, 0]] - second_ns[candidates[:, 1]])
