@@ -11,18 +11,17 @@ from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import moved
 
-_TINY = 1e-300
 ASKED, TAKEN = 1, 2   # what growth did with a row; 0 for those it never came near
 
 
 class Points(NamedTuple):
     """Points that bodies grow over.
 
-    points       (N, 3) float64
-    normals      (N, 3) float64   NaN where unknown
-    tolerance_m  (N,) float64     how far they may be from the target and still be explained
-    by_ego_m     (N,) float64     how far they are from it, at most the cap, without moving,
-    by_ego_plane_m  (N,) float64  and from its planes
+    points          (N, 3) float64
+    normals         (N, 3) float64   NaN where unknown
+    tolerance_m     (N,) float64     how far they may be from the target and still be explained
+    by_ego_m        (N,) float64     how far they are from it, at most the cap, without moving,
+    by_ego_plane_m  (N,) float64     and from its planes
     """
 
     points: np.ndarray
@@ -80,7 +79,7 @@ def grow_each(
     """What each of H growths did with each row (H, N) uint8, and the motions (H, 4, 4) of the bodies.
 
     Growth h begins at the rows seeds[bounds[h]: bounds[h + 1]] with the motion starts[h]; only rows that are
-    `free` (N,) are taken. One that stays too small takes none. `source` is the tree over `own`, the others
+    `free` (N,) are taken. One that is given up takes none. `source` is the tree over `own`, the others
     are of the surface that bodies move onto and of its ground.
     """
     did, motions = np.zeros((len(starts), len(own.points)), np.uint8), starts.copy()
@@ -123,8 +122,8 @@ def _grow(
         if len(rows) < limits.min_points:
             return
         shift_m = _fit(rows, own, target, target_normals, ground, limits, fit, gates_m, motion)
-        if shift_m < limits.least_shift_m or _share_left(
-                rows, motion, own, target, target_normals, ground, limits, nearest) > limits.most_left:
+        if shift_m < limits.least_shift_m or _leaves_too_much(
+                rows, motion, own, target, target_normals, ground, limits, nearest):
             return
     did[rows] = TAKEN
 
@@ -185,8 +184,8 @@ def _is_explained(own_m, plane_m, row, own, limits):
 
 
 @njit()
-def _share_left(rows, motion, own, target, target_normals, ground, limits, nearest):
-    """What the motion leaves of the rows' squared misfit to planes and ground, as a share of that at rest."""
+def _leaves_too_much(rows, motion, own, target, target_normals, ground, limits, nearest):
+    """Whether a motion leaves more than a share of the rows' squared misfit at rest, to planes and ground."""
     left_sq, at_rest_sq = 0.0, 0.0
     for row in rows:
         x, y, z = moved(own.points[row], motion)
@@ -195,7 +194,7 @@ def _share_left(rows, motion, own, target, target_normals, ground, limits, neare
         _, nearest_sq = trees.nearest(ground, x, y, z, left_m * left_m, -1)
         left_sq += nearest_sq
         at_rest_sq += own.by_ego_plane_m[row] ** 2
-    return left_sq / max(at_rest_sq, _TINY)
+    return left_sq > limits.most_left * at_rest_sq
 
 
 @njit()

@@ -42,7 +42,7 @@ class Body:
 class Growth:
     """How a body grew.
 
-    body   Body or None   None if it stayed too small, or is too slow
+    body   Body or None   None if it was given up
     asked  (N,) bool      the rows of the view that were asked whether they belong to it
     """
 
