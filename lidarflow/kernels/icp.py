@@ -128,8 +128,9 @@ def onto_planes(
 ):
     """Motion (4, 4) of points (N, 3) with normals (N, 3) onto a surface, from a turn and a shift (3,).
 
-    Each round is one Gauss-Newton step of Σ ρ(n · off) + w Σ ρ(off) over pairs no farther apart than the
-    round's gate; n is the plane where normals agree, ρ of Geman and McClure.
+    Each round is one Gauss-Newton step of Σ ρ(n · off) + w Σ ρ(off) + h (up · shift)² over pairs no farther
+    apart than the round's gate; n is the plane where normals agree, ρ of Geman and McClure, `up` (3,) the
+    ground's normal, and h `along_ground` times the weight of all pairs.
     """
     centre = mean(points)
     shift = shift.copy()
@@ -244,6 +245,7 @@ def _search(target, x, y, z, gate_m, i, nearest):
 
 @njit()
 def mean(points):
+    """The mean (3,) of points (N, 3)."""
     mean = np.zeros(3)
     for i in range(len(points)):
         for k in range(3):

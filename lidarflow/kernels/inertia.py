@@ -6,7 +6,6 @@ J = S + m (|q|² I − q qᵀ). It makes a twist (ω, v) a wrench (J ω + h × v
 of the normal equations. Blocks of the points that move as one are their sum.
 """
 
-
 from lidarflow.kernels.compiled import FUSED, njit
 from lidarflow.kernels.rotations import cross
 
