@@ -40,16 +40,16 @@ def build(points: np.ndarray, cell_m: float) -> Cells:
 def built(points, cell_m):
     """As `build`, for other kernels."""
     place, number, counts = _hashed(points, cell_m)
-    order, bounds = _by_number(number, counts)
+    order, bounds = by_number(number, counts)
     table, column, heights = _columns(place)
-    stacked, stacks = _by_number(column, heights)
+    stacked, stacks = by_number(column, heights)
     for k in range(len(heights)):
         _sort_by_height(stacked[stacks[k]: stacks[k + 1]], place)
     return Cells(cell_m, place, order, bounds, table, stacked, stacks)
 
 
 @njit()
-def _by_number(number, counts):
+def by_number(number, counts):
     """Rows (N,) by their number, ascending in each, and where each of the numbers begins, and the end."""
     bounds = np.zeros(len(counts) + 1, np.int64)
     bounds[1:] = np.cumsum(counts)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.sorting import sort
 from lidarflow.kernels.union_find import join, labels
 
 
@@ -50,7 +51,7 @@ def _sides(triangles, more, count):
     edges, found = np.empty((len(upper), 2), np.int32), 0
     for i in range(count):
         own = upper[first[i]: first[i + 1]]
-        _sort(own)
+        sort(own)
         for k in range(len(own)):
             if k == 0 or own[k] != own[k - 1]:
                 edges[found, 0], edges[found, 1] = i, own[k]
@@ -74,17 +75,6 @@ def _put(upper, first, a, b):
     i = min(a, b)
     first[i] -= 1
     upper[first[i]] = max(a, b)
-
-
-@njit()
-def _sort(few):
-    """Sort a handful of numbers in place, by insertion."""
-    for k in range(1, len(few)):
-        number, at = few[k], k
-        while at > 0 and few[at - 1] > number:
-            few[at] = few[at - 1]
-            at -= 1
-        few[at] = number
 
 
 @njit()

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.sorting import sort
 
 _CHUNK = 2048       # places that one thread takes at a time; most are told by a glance
 _BLOCK = 4          # cells along a side of a block, which is as wide as the reach
@@ -282,12 +283,7 @@ def _level(ground, x, y, reach_sq, near_sq, near_heights):
     count = len(near_heights)
     if math.isnan(near_heights[count - 1]):
         return np.nan
-    for k in range(1, count):
-        height, place = near_heights[k], k
-        while place > 0 and near_heights[place - 1] > height:
-            near_heights[place] = near_heights[place - 1]
-            place -= 1
-        near_heights[place] = height
+    sort(near_heights)
     return 0.5 * (near_heights[(count - 1) // 2] + near_heights[count // 2])
 
 

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from lidarflow.kernels.compiled import njit
+from lidarflow.kernels.sorting import sort
 
 _INTENSITY_GRAIN = 1e-6   # keep the mean of two slopes defined where both are 0
 _DEPTH_GRAIN_M = 0.005
@@ -56,7 +57,7 @@ def _surface_depth(readings, shares, count, max_jump_m, in_order):
     if count == 0:
         return 0.0
     in_order[:count] = readings[:count]
-    _sort(in_order, count)
+    sort(in_order[:count])
     middle = in_order[(count - 1) // 2]
     total = weight = 0.0
     for k in range(count):
@@ -64,17 +65,6 @@ def _surface_depth(readings, shares, count, max_jump_m, in_order):
             total += shares[k] * readings[k]
             weight += shares[k]
     return total / weight
-
-
-@njit()
-def _sort(values, count):
-    for k in range(1, count):
-        value = values[k]
-        j = k - 1
-        while j >= 0 and values[j] > value:
-            values[j + 1] = values[j]
-            j -= 1
-        values[j + 1] = value
 
 
 @njit(parallel=True)
@@ -97,7 +87,7 @@ def halve(intensity, depth, max_jump_m):
                 if reading > 0.0:
                     middles[count] = reading
                     count += 1
-            _sort(middles, count)
+            sort(middles[:count])
             middle = middles[(count - 1) // 2] if count else 0.0
             plain = plain_weight = near = near_depth = near_weight = 0.0
             for j in range(max(2 * v - 1, 0), min(2 * v + 3, rows)):

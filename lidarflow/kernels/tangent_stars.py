@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from lidarflow.kernels import grid
+from lidarflow.kernels import cells, grid
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.mesh import continuous_at
+from lidarflow.kernels.sorting import sort
 
 _MAX_NEIGHBOURS = 100   # looked at per point, as in Marton et al. 2009
 _MAX_STAR = 16          # triangles around one point
@@ -97,40 +98,29 @@ def _agreed(stars, order):
             # Three rows in one number would overflow where there are millions of points.
             lowest[found], others[found] = low, (a + b + c - low - high) * count + high
             found += 1
-    sorted_others, ends = _sorted_by_lowest(lowest[:found], others[:found], count)
-    return _repeated(sorted_others, ends, found // 2)
+    lowest, others = lowest[:found], others[:found]
+    by_lowest, bounds = cells.by_number(lowest, np.bincount(lowest, minlength=count))
+    others = others[by_lowest]
+    for i in range(count):
+        sort(others[bounds[i]: bounds[i + 1]])
+    return _repeated(others, bounds, found // 2)
 
 
 @njit()
-def _sorted_by_lowest(lowest, others, count):
-    """The `others` (S,) by their `lowest` (S,), ascending for each, and where each of `count` ends."""
-    counts = np.zeros(count, np.int64)
-    for t in range(len(lowest)):
-        counts[lowest[t]] += 1
-    starts = np.cumsum(counts) - counts
-    ends, ascending = starts.copy(), np.empty(len(others), np.int64)
-    for t in range(len(lowest)):
-        i, at = lowest[t], ends[lowest[t]]
-        while at > starts[i] and ascending[at - 1] > others[t]:
-            ascending[at] = ascending[at - 1]
-            at -= 1
-        ascending[at] = others[t]
-        ends[i] += 1
-    return ascending, ends
+def _repeated(others, bounds, room):
+    """Triangles (T, 3) int32, at most `room`, that are there more than once.
 
-
-@njit()
-def _repeated(others, ends, room):
-    """Triangles (T, 3) int32, at most `room`, that `_sorted_by_lowest` gives more than once."""
-    triangles, found, start = np.empty((room, 3), np.int32), 0, 0
-    for i in range(len(ends)):
-        for at in range(start + 1, ends[i]):
-            is_second = at == start + 1 or others[at - 2] != others[at]
+    Point i is the lowest corner of those whose `others`, ascending, are others[bounds[i]: bounds[i + 1]].
+    """
+    count = len(bounds) - 1
+    triangles, found = np.empty((room, 3), np.int32), 0
+    for i in range(count):
+        for at in range(bounds[i] + 1, bounds[i + 1]):
+            is_second = at == bounds[i] + 1 or others[at - 2] != others[at]
             if others[at - 1] == others[at] and is_second:
                 triangles[found, 0] = i
-                triangles[found, 1], triangles[found, 2] = others[at] // len(ends), others[at] % len(ends)
+                triangles[found, 1], triangles[found, 2] = others[at] // count, others[at] % count
                 found += 1
-        start = ends[i]
     return triangles[:found].copy()
 
 
