@@ -18,6 +18,9 @@ class ImagesConfig:
     max_depth_jump_m: float = setting(
         0.1, "depths this far from a pixel's middle one are another surface's and not averaged with it",
         low=1e-3)
+    max_exposure_change: float = setting(
+        0.01, "a gain and offset that change the second image's intensity (0 .. 1) by more on average are "
+        "undone; 1 = never", low=0, high=1)
 
 
 @dataclass(frozen=True, slots=True)

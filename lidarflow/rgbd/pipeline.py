@@ -5,7 +5,7 @@ import numpy as np
 from lidarflow.config import given
 from lidarflow.kernels import cluster_images
 from lidarflow.rgbd import clusters as geometric
-from lidarflow.rgbd import odometry, propagation, pyramid, refinement, segmentation
+from lidarflow.rgbd import exposure, odometry, propagation, pyramid, refinement, segmentation
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult, check_is
 from lidarflow.stopwatch import Stopwatch
@@ -70,9 +70,15 @@ def _estimate(
         clusters = geometric.find(source, config.clusters)
         b_before = None if previous is None else propagation.carried(previous, source[0], clusters)
     nothing_moves = np.zeros(len(clusters.centres))
+    images = source, target
+    with timed("exposure"):     # where pixels are large, the motion between two frames is small
+        source, target = exposure.matched(*images, np.eye(4), config, min(2, len(source) - 1))
     with timed("robust odometry"):
         static = robust = odometry.robust(
             source, target, clusters, nothing_moves if b_before is None else b_before, config)
+    if source is not images[0]:
+        with timed("exposure"):
+            source, target = exposure.matched(*images, robust, config)
     b, motions = nothing_moves, np.tile(static, (len(nothing_moves), 1, 1))
     if config.segmentation.enabled:
         with timed("segmentation"):

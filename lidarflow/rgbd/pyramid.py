@@ -10,6 +10,7 @@ from lidarflow.kernels import images
 from lidarflow.rgbd_config import ImagesConfig
 from lidarflow.rgbd_types import Camera, RgbdFrame, check_is
 
+_NEAREST_M = 0.01    # nearer to the camera, or behind it, nothing is seen
 _SMALLEST_SIDE = 8   # pixels; a coarser level would have no gradients to speak of
 
 
@@ -28,13 +29,40 @@ class Level:
     packed: np.ndarray
     points: np.ndarray
 
+    def some_pixels(self, most: int) -> np.ndarray:
+        """Numbers v W + u (N,) of pixels with depth, N ≤ `most`, evenly chosen."""
+        pixels = np.flatnonzero(self.points[..., 2])
+        return pixels[:: max(-(-len(pixels) // most), 1)]
+
+    def nearest_pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whether points (N, 3) [m] are in the image, and number v W + u (N,) of the nearest pixel or 0."""
+        height, width = self.points.shape[:2]
+        x, y, z = np.asarray(points, float).T
+        ahead = z > _NEAREST_M
+        z = np.where(ahead, z, 1.0)
+        u = np.rint(self.camera.fx * x / z + self.camera.cx)
+        v = np.rint(self.camera.fy * y / z + self.camera.cy)
+        inside = ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        return inside, np.where(inside, v * width + u, 0.0).astype(int)
+
 
 def build(frame: RgbdFrame, camera: Camera, config: ImagesConfig) -> tuple[Level, ...]:
     """The levels of a frame, the finest, of the working size, first.
 
     Raises DataError for a frame without any depth, one that is too small, or not of the camera's size.
     """
-    intensity, depth, camera = _resized(frame, camera, config)
+    return _levels(*_resized(frame, camera, config), config)
+
+
+def with_intensity(levels: tuple[Level, ...], intensity: np.ndarray, config: ImagesConfig
+                   ) -> tuple[Level, ...]:
+    """A pyramid with the depth of another and an intensity (H, W) float32 of its finest size."""
+    finest = levels[0]
+    return _levels(intensity, np.ascontiguousarray(finest.packed[..., 1]), finest.camera, config)
+
+
+def _levels(intensity: np.ndarray, depth: np.ndarray, camera: Camera, config: ImagesConfig
+            ) -> tuple[Level, ...]:
     levels = [_level(intensity, depth, camera)]
     while len(levels) < config.levels and min(camera.width, camera.height) >= 2 * _SMALLEST_SIDE:
         intensity, depth = images.halve(intensity, depth, config.max_depth_jump_m)
