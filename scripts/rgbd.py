@@ -4,6 +4,7 @@
     python scripts/rgbd.py --drift DATA/rgbd_tum_fr1_desk9 DATA/rgbd_open3d5
     python scripts/rgbd.py --rooms 8
     python scripts/rgbd.py --exposures 4
+    python scripts/rgbd.py --likeness DATA/rgbd_open3d5 DATA/rgbd_joint_vo_sf_pairs/*/
     python scripts/rgbd.py --times DATA/rgbd_joint_vo_sf_pairs
 
 Settings by --config and --set. Every row is made by the methods that the command line offers.
@@ -21,6 +22,7 @@ from lidarflow import config as settings
 from lidarflow import pose, rgbd_methods, rgbd_metrics, synthetic
 from lidarflow.datasets import tum
 from lidarflow.datasets.rgbd_folders import RgbdFolder, open_rgbd
+from lidarflow.errors import DataError
 from lidarflow.rgbd import pyramid
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult
@@ -154,16 +156,19 @@ def exposures_table(count: int, config: RgbdConfig) -> str:
             pairs += [(sequence[k][0], sequence[k + 1][0], sequence[k][1]) for k in range(0, frames - 1, 3)]
         for gain, offset in EXPOSURES:
             for name, chosen in (("undone", config), ("left", left)):
-                found = []
+                found, refused = [], 0
                 for source, target, truth in pairs:
                     pair = RgbdPair(source, exposed(target, gain, offset), camera)
-                    result = rgbd_methods.estimate_flow("ours", pair, chosen)
-                    found.append(rgbd_metrics.score(result, truth))
+                    try:
+                        result = rgbd_methods.estimate_flow("ours", pair, chosen)
+                        found.append(rgbd_metrics.score(result, truth))
+                    except DataError:
+                        refused += 1
                 rows.append([room.replace("_", " "), f"{gain:g} I {offset:+g}", name, f"{len(pairs)}",
-                             spread(found, "odometry_error_m", max, 1000, 1),
+                             f"{refused}", spread(found, "odometry_error_m", max, 1000, 1),
                              spread(found, "odometry_error_deg", max, 1, 3), spread(found, "iou", min, 1, 2),
                              spread(found, "epe_m", max, 1000, 1)])
-    return table(["room", "second image", "exposure", "pairs", "odometry [mm]", "[deg]",
+    return table(["room", "second image", "exposure", "pairs", "refused", "odometry [mm]", "[deg]",
                   "moving IoU", "EPE [mm]"], rows)
 
 
@@ -171,6 +176,27 @@ def exposed(frame: RgbdFrame, gain: float, offset: float) -> RgbdFrame:
     """The frame as a sensor of 256 greys has it in another exposure."""
     greys = np.round(255.0 * np.clip(gain * frame.intensity + offset, 0.0, 1.0)).astype(np.float32)
     return RgbdFrame(greys / np.float32(255.0), frame.depth, frame.time_ns, frame.name)
+
+
+def likeness_table(folders: list[Path], config: RgbdConfig) -> str:
+    """How many pairs are refused: consecutive frames of each folder, and frames of one and of another."""
+    opened = [open_rgbd(path) for path in folders]
+    small = [[pyramid.at_working_size(folder.frame(k), folder.camera, config.images)
+              for k in range(len(folder))] for folder in opened]
+    pairs = {"consecutive": [(frames[k][0], frames[k + 1][0], frames[k][1])
+                             for frames in small for k in range(len(frames) - 1)],
+             "of two folders": [(a[i][0], b[j][0], a[i][1]) for a in small for b in small if a is not b
+                                for i in (0, len(a) // 2, -1) for j in (0, -1)]}
+    rows = []
+    for name, of_kind in pairs.items():
+        reasons = []
+        for source, target, camera in of_kind:
+            try:
+                rgbd_methods.estimate_flow("ours", RgbdPair(source, target, camera), config)
+            except DataError as error:
+                reasons.append("likeness" if "brightness" in str(error) else "overlap")
+        rows.append([name, str(len(of_kind)), str(reasons.count("overlap")), str(reasons.count("likeness"))])
+    return table(["frames", "pairs", "refused for their overlap", "for their likeness"], rows)
 
 
 def times_table(data: Path, config: RgbdConfig) -> str:
@@ -205,6 +231,7 @@ def main() -> None:
     parser.add_argument("--drift", type=Path, nargs="+")
     parser.add_argument("--rooms", type=int, metavar="COUNT")
     parser.add_argument("--exposures", type=int, metavar="COUNT")
+    parser.add_argument("--likeness", type=Path, nargs="+")
     parser.add_argument("--times", type=Path)
     parser.add_argument("--config", type=Path)
     parser.add_argument("--set", dest="overrides", action="append", default=[])
@@ -212,7 +239,7 @@ def main() -> None:
     config = settings.load(options.config, tuple(options.overrides), RgbdConfig)
     for wanted, make in ((options.pairs, pairs_table), (options.drift, drift_table),
                          (options.rooms, rooms_table), (options.exposures, exposures_table),
-                         (options.times, times_table)):
+                         (options.likeness, likeness_table), (options.times, times_table)):
         if wanted:
             print(make(wanted, config), "\n")
 

@@ -6,13 +6,13 @@ import numba
 import numpy as np
 import pytest
 import rgbd_corner
-from rgbd_worlds import HALF_FRAMES, QVGA, frames, moving_share
+from rgbd_worlds import HALF_FRAMES, QVGA, ROOMS, frames, moving_share
 from shared_data import ROOT, SHARED, needs_shared
 
 from lidarflow import config, pose, rgbd_methods, rgbd_metrics
 from lidarflow.datasets.rgbd_folders import open_rgbd
 from lidarflow.errors import DataError
-from lidarflow.rgbd import RgbdEstimator, estimate_flow
+from lidarflow.rgbd import RgbdEstimator, estimate_flow, odometry, pyramid
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult
 
@@ -181,6 +181,35 @@ def test_frames_with_depth_for_a_part_of_each_other_are_enough(share):
     assert pose.translation_distance(MOTION, result.odometry) < 0.002
 
 
+def upside_down(frame: RgbdFrame) -> RgbdFrame:
+    return RgbdFrame(frame.intensity[::-1].copy(), frame.depth[::-1].copy(), name=frame.name)
+
+
+def unrelated() -> dict[str, tuple[RgbdFrame, RgbdFrame]]:
+    """Frames with depth nearly everywhere, of different places."""
+    room, corner = frames("living_room")[0][0], rgbd_corner.frame(np.eye(4))
+    other_paper = frames("living_room", seed=2)[0][0]
+    return {"a room and a corner": (room, corner), "a corner and a room": (corner, room),
+            "upside down": (room, upside_down(room)), "furnished alike": (room, other_paper)}
+
+
+@pytest.mark.parametrize("name", unrelated())
+@pytest.mark.parametrize("settings", [DEFAULTS, PLAIN], ids=["default", "plain"])
+def test_frames_of_different_places_are_refused(name, settings):
+    source, target = unrelated()[name]
+    with pytest.raises(DataError, match=r"odometry: \d+% of .* has the depth and brightness of the first"):
+        estimate_flow(RgbdPair(source, target, QVGA), settings)
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_what_consecutive_frames_of_a_room_see_again_is_nearly_all_alike(name):
+    (source, truth), (target, _) = frames(name)[:2]
+    levels = [pyramid.build(frame, QVGA, DEFAULTS.images)[0] for frame in (source, target)]
+    assert odometry.likeness(*levels, truth.flow) > 0.9
+    assert odometry.likeness(*levels, np.full_like(truth.flow, 0.5)) < 0.5
+    assert odometry.likeness(*levels, np.full_like(truth.flow, -100.0)) == 0.0
+
+
 def test_an_estimator_goes_on_after_frames_that_show_nothing_in_common():
     first, second, third = (frame for frame, _ in frames("living_room")[:3])
     estimator = RgbdEstimator(QVGA)
@@ -251,3 +280,13 @@ def test_drift_over_real_images_is_small_and_below_open3d_s(name, most_m, most_d
     ours, theirs = drifts["ours"], drifts["open3d"]
     assert ours.per_frame_m < min(most_m, theirs.per_frame_m)
     assert ours.per_frame_deg < min(most_deg, theirs.per_frame_deg)
+
+
+@needs_shared
+@pytest.mark.parametrize("name", TABLE_3)
+def test_real_frames_of_different_places_are_refused(name):
+    folder = open_rgbd(SHARED / "rgbd_joint_vo_sf_pairs" / name)
+    other = open_rgbd(SHARED / "rgbd_open3d5").frame(0)
+    for pair in ((folder.frame(0), other), (other, folder.frame(1))):
+        with pytest.raises(DataError, match=r"has the depth and brightness of the first|is seen again"):
+            estimate_flow(RgbdPair(*pair, folder.camera))

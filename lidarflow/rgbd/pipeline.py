@@ -97,6 +97,7 @@ def _estimate(
         flow = cluster_images.blended_flow(
             source[0].points, label, clusters.centres, clusters.touch,
             np.float32(config.clusters.blending_per_m2), odometry.rows34(motions))
+        odometry.require_likeness(source[0], target[0], flow)
         is_dynamic = np.append(b > config.segmentation.moving_above, False)[label]
     return RgbdResult(
         flow, source[0].points, label >= 0, label, b, motions, static, is_dynamic, source[0].camera,
