@@ -13,6 +13,7 @@ from lidarflow.errors import InputError
 from lidarflow.rows import whole_or_nan
 
 _NS_LIMIT = 2**63
+_KINDS = {"b": "bool", "f": "float", "i": "int", "u": "unsigned int"}     # what numpy's letters stand for
 
 
 def as_points(name: str, points: Any) -> np.ndarray:
@@ -65,14 +66,15 @@ def check(name: str, array: np.ndarray, shape: tuple, kind: str) -> None:
     """Raise ValueError unless `array` has `shape` (None = any length) and dtype kind in `kind`."""
     if not isinstance(array, np.ndarray):
         raise ValueError(f"{name}: expected a numpy array, got {type(array).__name__}")
-    wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ")"
+    wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + (",)" if len(shape) == 1 else ")")
     fits = array.ndim == len(shape) and all(
         n is None or n == m for n, m in zip(shape, array.shape, strict=True)
     )
     if not fits:
         raise ValueError(f"{name}: expected shape {wanted}, got {array.shape}")
     if array.dtype.kind not in kind:
-        raise ValueError(f"{name}: expected dtype kind {kind!r}, got {array.dtype}")
+        wanted = " or ".join(_KINDS[letter] for letter in kind)
+        raise ValueError(f"{name}: expected dtype {wanted}, got {array.dtype}")
     if np.ma.is_masked(array):
         raise ValueError(f"{name}: expected no mask, got {np.ma.count_masked(array)} masked values")
 

@@ -246,11 +246,20 @@ def test_kitti_raw_has_times_poses_and_truth(tmp_path, scans):
     write_truth(tmp_path / "truth" / "0000000004.npz", len(POINTS), track=None)
     assert "lacks track" in message(open_dataset(tmp_path).truth, 0)
     write_truth(tmp_path / "truth" / "0000000004.npz", len(POINTS), valid=np.ones(2, bool))
-    assert "Truth.valid" in message(open_dataset(tmp_path).truth, 0)
+    assert "4.npz: 'valid': expected shape (5,), got (2,)" in message(open_dataset(tmp_path).truth, 0)
+    for wrong, said in (
+            ({"dynamic": np.zeros(5, np.uint8)}, "'dynamic': expected dtype bool, got uint8"),
+            ({"track": np.array(list("abcde"))}, "'track': expected numbers, got <U1"),
+            ({"target_from_source": np.ones((4, 4))}, "'target_from_source': expected a rigid motion"),
+            ({"target_from_source": np.eye(3)}, "'target_from_source': expected shape (4, 4), got (3, 3)"),
+            ({"category": np.full(5, 9)}, "'category': expected numbers of BACKGROUND, CAR"),
+            ({"category": np.zeros(5)}, "'category': expected dtype int or unsigned int, got float64")):
+        write_truth(tmp_path / "truth" / "0000000004.npz", len(POINTS), **wrong)
+        assert f"0000000004.npz: {said}" in message(open_dataset(tmp_path).truth, 0)
     flow = np.zeros((len(POINTS), 3))
     flow[[1, 3], 2] = np.nan, np.inf
     write_truth(tmp_path / "truth" / "0000000004.npz", len(POINTS), flow=flow)
-    assert ("0000000004.npz: Truth.flow: not finite in 2 valid rows, the first is row 1"
+    assert ("0000000004.npz: 'flow': not finite in 2 valid rows, the first is row 1"
             in message(open_dataset(tmp_path).truth, 0))
     write_truth(tmp_path / "truth" / "0000000004.npz", len(POINTS), flow=flow, valid=np.isfinite(flow[:, 2]))
     assert open_dataset(tmp_path).truth(0).valid.sum() == len(POINTS) - 2

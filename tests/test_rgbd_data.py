@@ -267,6 +267,10 @@ def test_truth_of_another_size_is_refused(folder, tmp_path):
              is_dynamic=truth.is_dynamic[:-1], odometry=truth.odometry)
     with pytest.raises(DataError, match="320x239"):
         open_rgbd(place).truth(0)
+    np.savez(place / "truth" / "0.000000.npz", flow=truth.flow, valid=truth.valid, odometry=truth.odometry,
+             is_dynamic=truth.is_dynamic.astype(int))
+    with pytest.raises(DataError, match=r"0\.000000\.npz: 'is_dynamic': expected dtype bool, got int64"):
+        open_rgbd(place).truth(0)
     assert open_rgbd(place).truth(1) is None
 
 

@@ -2,7 +2,7 @@
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -17,6 +17,7 @@ from lidarflow.types import Scan, Truth
 _PERIOD_NS = 100_000_000     # of 10 Hz
 _EARLIEST_S, _LATEST_S = 10**8, 9 * 10**9     # what a stamp may be; 64-bit nanoseconds end at 9.2e9 s
 TRUTH_ARRAYS = ("flow", "valid", "dynamic", "track", "target_from_source")
+_ARRAY_OF = {"ego_motion": "target_from_source", "is_dynamic": "dynamic", "object_id": "track"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,13 +190,29 @@ def read_truth(file: Path, rows: int, name: str) -> Truth:
         raise DataError(f"{file}: {found} rows, but {name} has {rows} points; expected one row per point")
     try:
         return Truth(
-            flow=arrays["flow"].astype(np.float64),
-            ego_motion=arrays["target_from_source"].astype(np.float64),
+            flow=_numbers(arrays, "flow", np.float64),
+            ego_motion=_numbers(arrays, "target_from_source", np.float64),
             valid=arrays["valid"],
             is_dynamic=arrays["dynamic"],
-            object_id=arrays["track"].astype(np.int64),
+            object_id=_numbers(arrays, "track", np.int64),
             category=arrays.get("category"),
             is_ground=arrays["is_ground"] if "is_ground" in arrays else np.zeros(rows, bool),
         )
     except ValueError as error:
-        raise DataError(f"{file}: {clouds.one_line(error)}") from None
+        raise DataError(f"{file}: {in_words_of_the_file(error, _ARRAY_OF)}") from None
+
+
+def in_words_of_the_file(error: ValueError, array_of: Mapping[str, str] | None = None) -> str:
+    """What a Truth, or RgbdTruth, says of an attribute, as said of the array in a file that it is made of.
+
+    array_of  the names of the arrays that are not called as the attributes are
+    """
+    return re.sub(r"^(?:Rgbd)?Truth\.(\w+)", lambda found: f"'{(array_of or {}).get(found[1], found[1])}'",
+                  clouds.one_line(error))
+
+
+def _numbers(arrays: dict[str, np.ndarray], name: str, dtype: type) -> np.ndarray:
+    """An array of a truth file as `dtype`; ValueError where it holds no numbers."""
+    if arrays[name].dtype.kind not in "fiu":
+        raise ValueError(f"'{name}': expected numbers, got {arrays[name].dtype}")
+    return arrays[name].astype(dtype)

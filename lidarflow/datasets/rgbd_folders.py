@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow.datasets import clouds, tables, tum
-from lidarflow.datasets.base import frame_number
+from lidarflow.datasets.base import frame_number, in_words_of_the_file
 from lidarflow.datasets.folder import folder_name
 from lidarflow.datasets.rgbd_images import (
     DEFAULT_DEPTH_SCALE,
@@ -104,7 +104,7 @@ class RgbdFolder:
         try:
             truth = RgbdTruth(**arrays)
         except ValueError as error:
-            raise DataError(f"{file}: {clouds.one_line(error)}") from None
+            raise DataError(f"{file}: {in_words_of_the_file(error)}") from None
         height, width = truth.valid.shape
         check_camera(self.camera, width, height, file, "the camera of the images")
         return truth
