@@ -30,8 +30,11 @@ def as_points(name: str, points: Any) -> np.ndarray:
     except (TypeError, ValueError, RuntimeError) as error:
         kind = type(points).__name__
         raise InputError(f"{name}: a {kind} that is no array ({error}); {expected}") from None
-    if found.dtype.kind == "O":
+    if found.dtype.kind == "O" and found.ndim == 0:
         raise InputError(f"{name}: of type {type(points).__name__}; {expected}")
+    if found.dtype.kind == "O":
+        raise InputError(f"{name}: an array {found.shape} of dtype object, as rows of unequal length or "
+                         f"entries that are no numbers make it; {expected} of numbers, such as float64")
     if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in "fiu":
         raise InputError(f"{name}: an array {found.shape} of {found.dtype}; {expected}; "
                          "where rows have more columns, pass points[:, :3]")

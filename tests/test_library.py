@@ -102,6 +102,9 @@ NO_POINTS = [
     (np.zeros((4, 3), bool), "an array (4, 3) of bool"),
     ([[1, 2], [3, 4]], "an array (2, 2) of int64"),
     ([[1, 2, 3], [4, 5]], "source: a list that is no array"),
+    (np.array([[1, 2, 3], [4, 5]], object), "source: an array (2,) of dtype object, as rows of unequal len"),
+    (np.zeros((4, 3), object), "an array (4, 3) of dtype object"),
+    ([[1, 2, None]], "expected points (N, 3) of numbers, such as float64"),
     (None, "source: of type NoneType; expected points (N, 3)"),
     ("scan0.bin", "source: the path 'scan0.bin'; expected points (N, 3), lidarflow.read_scan reads them"),
     (Path("scan0.bin"), "the path 'scan0.bin'")]
