@@ -24,6 +24,7 @@ from lidarflow.terminal import check_arrows as _check_arrows
 from lidarflow.terminal import check_exists as _check_exists
 from lidarflow.terminal import check_live_view as _check_live_view
 from lidarflow.terminal import check_words as _check_words
+from lidarflow.terminal import notes_of as _notes_of
 from lidarflow.terminal import show as _print
 from lidarflow.terminal import working as _working
 
@@ -69,7 +70,7 @@ def main() -> None:
     except SystemExit as stop:
         if stop.code in (_INTERRUPTED, _TERMINATED):
             how = "interrupted" if stop.code == _INTERRUPTED else "terminated"
-            print(f"lidarflow: {how}", file=sys.stderr)
+            print("; ".join([f"lidarflow: {how}", *_notes_of(stop)]), file=sys.stderr)
         raise
     finally:
         _leave_what_is_stalled()

@@ -16,6 +16,7 @@ from lidarflow.terminal import (
     announce_first_use,
     check_live_view,
     progress,
+    resumable,
     show,
     working,
 )
@@ -167,7 +168,7 @@ def _process(folder: "RgbdFolder", method: str, settings: "RgbdConfig", out: Pat
     if is_done:
         return
     announce_first_use()
-    with progress("frame pairs", len(frames) - 1) as bar:
+    with resumable(out), progress("frame pairs", len(frames) - 1) as bar:
 
         def on_pair(report: "RgbdReport") -> None:
             bar.update(0, advance=1, description=f"frame pairs, {report.frame} done")

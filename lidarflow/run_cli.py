@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lidarflow.errors import ConfigError
-from lidarflow.terminal import announce_first_use, check_live_view, progress, show
+from lidarflow.terminal import announce_first_use, check_live_view, progress, resumable, show
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -85,12 +85,13 @@ def process(
         print(said)
     if is_done:
         return
-    if spread is not None:
-        _compute(dataset, frames, settings, out, method, going, spread)
-        going = replace(going, resume=True)
-    with pairs_done(len(frames) - 1) as on_pair:
-        reports = runner.process(
-            dataset, frames, settings, out, viewing, lambda report: on_pair(report.frame), method, going)
+    with resumable(out):
+        if spread is not None:
+            _compute(dataset, frames, settings, out, method, going, spread)
+            going = replace(going, resume=True)
+        with pairs_done(len(frames) - 1) as on_pair:
+            reports = runner.process(
+                dataset, frames, settings, out, viewing, lambda report: on_pair(report.frame), method, going)
     print()
     for line in skipped_lines(skipped, len(frames), len(reports)):
         print(line)

@@ -1,5 +1,6 @@
 """Tables for people, from reports; nothing here prints."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -7,7 +8,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from lidarflow import pose, run_folder
+from lidarflow import pose, provenance, run_folder
 from lidarflow.compare import Comparison
 from lidarflow.config import Config, describe
 from lidarflow.metrics import Alignment
@@ -179,19 +180,23 @@ def earlier_run(
     """
     if going.resume and is_complete(data, frames, config, out, method, going):
         damaged = damaged_files(out)
-        return _complete_line(out, damaged), not damaged
+        return _complete_lines(out, damaged, provenance.read_any(out).skipped), not damaged
     run_folder.check(out)
     if going.resume or not run_folder.is_run(out):
         return None, False
     return f"replacing  {out}: holds an earlier run, which the results of this one replace", False
 
 
-def _complete_line(out: Path, damaged: list[str]) -> str:
-    """What is said of a run that was complete, and of its files that are `damaged` by now."""
-    if not damaged:
-        return f"complete   {out}: nothing is left to do"
-    others = f" and {len(damaged) - 1} more files are" if damaged[1:] else " is"
-    return f"damaged    {out}: {damaged[0]}{others} missing or cut off; all pairs are computed anew"
+def _complete_lines(out: Path, damaged: list[str], left_out: Sequence[int]) -> str:
+    """What is said of a complete run, of its files that are `damaged` by now, and of scans left out of it."""
+    if damaged:
+        others = f" and {len(damaged) - 1} more files are" if damaged[1:] else " is"
+        return f"damaged    {out}: {damaged[0]}{others} missing or cut off; all pairs are computed anew"
+    told = f"complete   {out}: nothing is left to do"
+    if left_out:
+        others = f" and {len(left_out) - 1} more" if left_out[1:] else ""
+        told += f"\nleft out   {left_out[0]}{others}: if usable by now, run again without --resume"
+    return told
 
 
 def where_results_are(out: Path, is_recorded: bool) -> list[str]:

@@ -1,5 +1,6 @@
 """What all commands of the command line share: options, the console, a spinner, the check for a viewer."""
 
+import contextlib
 import itertools
 import re
 import sys
@@ -68,6 +69,26 @@ def check_arrows(wanted: bool, shown: bool, instead: str) -> None:
     """ConfigError where arrows are wanted and nothing is shown or recorded; `instead` is what to ask for."""
     if wanted and not shown:
         raise ConfigError(f"--arrows: nothing is shown or recorded that could have them; {instead}")
+
+
+@contextlib.contextmanager
+def resumable(out: Path):
+    """An interruption on the way says, in a note, how the run in `out` goes on, if anything is kept."""
+    from lidarflow import io
+
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit) as stop:
+        if any((out / io.RESUME_FOLDER).rglob("*.npz")):
+            stop.add_note(f"finished pairs are kept in {out}, the same command with --resume goes on")
+        raise
+
+
+def notes_of(stop: BaseException | None) -> list[str]:
+    """The notes on what ended the program, and on what that came of: typer makes an exit of Ctrl-C."""
+    if stop is None:
+        return []
+    return [*getattr(stop, "__notes__", ()), *notes_of(stop.__cause__ or stop.__context__)]
 
 
 def announce_first_use() -> None:

@@ -464,14 +464,18 @@ def test_a_signal_is_one_line_and_leaves_only_whole_files(scans, tmp_path, sent,
                                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
     line = process.stdout.readline()
     # In the middle of the work: an interrupt while native packages are imported is the packages' affair.
-    while not list((tmp_path / "out" / "flow").glob("*.npz")) and process.poll() is None:
+    # The first pair's checkpoint is there by then too.
+    while not (tmp_path / "out" / "flow" / "000001.npz").exists() and process.poll() is None:
         time.sleep(0.01)
     process.send_signal(sent)
     _, err = process.communicate(timeout=60)
     assert "reading" in line and process.returncode == code
-    assert err == f"lidarflow: {told}\n" and not rests(tmp_path)
-    for file in tmp_path.rglob("*.npz"):
+    assert err == (f"lidarflow: {told}; finished pairs are kept in {tmp_path / 'out'}, the same command with "
+                   "--resume goes on\n")
+    assert not rests(tmp_path)
+    for file in (tmp_path / "out" / "flow").iterdir():
         io.load_flow(file)
+    assert all(io.is_whole(file) for file in tmp_path.rglob("*.npz"))
 
 
 def test_solver_is_short_for_its_setting(lidarflow, scans, tmp_path):

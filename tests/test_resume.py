@@ -274,6 +274,9 @@ def test_a_damaged_scan_is_skipped_and_counted(damaged, tmp_path, lidarflow, res
     before, after = ({number for frame, number in ids if frame == name} for name in ("000000", "000003"))
     assert before and not before & after      # a number is never given to another object
     lidarflow.ok("report", out, "--out", tmp_path / "report.html")
+    told = lidarflow.ok("run", damaged, "--out", out, "--skip-bad", "--resume")
+    assert told.endswith(f"complete   {out}: nothing is left to do\n"
+                         "left out   2: if usable by now, run again without --resume\n")
 
 
 def test_the_pair_after_a_gap_is_that_of_a_run_that_begins_there(damaged, street, tmp_path):
