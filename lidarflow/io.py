@@ -5,6 +5,7 @@ Files are written aside and moved into place, so that a reader never meets half 
 
 import contextlib
 import csv
+import itertools
 import json
 import os
 import zipfile
@@ -85,11 +86,13 @@ class FlowFile:
 def written_aside(path: Path) -> Iterator[Path]:
     """A path to write to that replaces `path` when the block ends well and vanishes when it does not.
 
-    Missing folders are made. Raises DataError where the file system refuses.
+    Missing folders are made, and vanish too where nothing comes into them. Raises DataError where the file
+    system refuses.
     """
     path = Path(path)
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
+        missing = list(itertools.takewhile(lambda folder: not folder.exists(), path.parents))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             yield aside
@@ -98,6 +101,9 @@ def written_aside(path: Path) -> Iterator[Path]:
             os.replace(aside, path)
         finally:
             aside.unlink(missing_ok=True)
+            for folder in missing:
+                with contextlib.suppress(OSError):     # it holds something, or was not even made
+                    folder.rmdir()
     except OSError as error:
         reason = error.strerror or str(error)
         raise DataError(f"cannot write {path}: {reason}; free space or choose another --out") from error

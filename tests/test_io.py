@@ -221,6 +221,23 @@ def test_missing_folders_are_made(tmp_path):
     assert (tmp_path / "a" / "b" / "m.json").read_text() == "{}\n"
 
 
+def test_folders_that_were_made_for_nothing_go_again(tmp_path):
+    def fail(others=()):
+        with pytest.raises(KeyboardInterrupt), io.written_aside(tmp_path / "a" / "b" / "m.json") as aside:
+            aside.write_text("half")
+            for other in others:
+                other.touch()
+            raise KeyboardInterrupt
+
+    fail()
+    assert not list(tmp_path.iterdir())
+    fail(others=[tmp_path / "a" / "other.txt"])
+    assert [file.name for file in tmp_path.rglob("*")] == ["a", "other.txt"]
+    (tmp_path / "a" / "b").mkdir()
+    fail()
+    assert (tmp_path / "a" / "b").is_dir(), "it was there before"
+
+
 # --- run folders ---
 
 def test_a_run_folder_is_made_and_used_again(tmp_path):
