@@ -223,9 +223,16 @@ def test_a_sequence_goes_on_after_a_bad_scan(name):
 @pytest.mark.parametrize("name", ["icp", "ransac_icp", "ego"])
 def test_too_few_points_are_one_clear_line(name):
     pair = worlds.plane_pair(rng())
-    few = ScanPair(pair.source, replace(pair.target, points=pair.target.points[:10]))
-    with pytest.raises(DataError, match="registration needs 30"):
+    few = ScanPair(pair.source, replace(pair.target, points=pair.target.points[:10], name="000007"))
+    with pytest.raises(DataError, match=r"^000007: registration: a scan has 10 points in range"):
         methods.find(name).estimate(few, Config())
+
+
+@pytest.mark.parametrize("name", ["ransac_icp", "ego"])
+def test_scans_that_have_nothing_in_common_are_named(name, room):
+    scans = replace(room[0].source, name="7"), Scan(rng().uniform(-70, 70, (3000, 3)), name="8")
+    with pytest.raises(DataError, match=r"ego-motion: .*% of 7 comes within .* m of 8, at least 30%"):
+        methods.find(name).estimate(ScanPair(*scans), Config())
 
 
 @pytest.mark.parametrize("name", NAMES)

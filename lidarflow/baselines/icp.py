@@ -39,17 +39,22 @@ class Icp(WholeScan):
 
     def _register(self, pair, source, target) -> Registered:
         with self._timed("registration"):
-            return Registered(register(_standing(pair.source, source), _standing(pair.target, target)))
+            return Registered(register(_standing(pair.source, source), _standing(pair.target, target),
+                                       (pair.source.name, pair.target.name)))
 
 
-def register(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """target_from_source (4, 4) of points (N, 3) and (M, 3) in metres; DataError for too few of them."""
+def register(source: np.ndarray, target: np.ndarray, names: tuple[str, str] = ("", "")) -> np.ndarray:
+    """target_from_source (4, 4) of points (N, 3) and (M, 3) in metres.
+
+    Raises DataError, which says whose they are (`names`), for too few of them.
+    """
     voxel_m = registration.voxel_for(source, _VOXEL_M)
     target_from_source = np.eye(4)
     for stage in STAGES:
         target_from_source = registration.point_to_point(
-            registration.thinned(source, stage.source * voxel_m),
-            registration.thinned(target, stage.target * voxel_m), stage.reach * voxel_m, target_from_source)
+            registration.thinned(source, stage.source * voxel_m, names[0]),
+            registration.thinned(target, stage.target * voxel_m, names[1]),
+            stage.reach * voxel_m, target_from_source)
     return registration.reproducible(target_from_source)
 
 

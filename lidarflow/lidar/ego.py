@@ -32,24 +32,25 @@ _MIN_OVERLAP = 0.3           # of the source within the third stage's reach of t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thinned:
-    """A scan for registration: points (M, 3), means per voxel in metres, and their planes."""
+    """A scan for registration: points (M, 3), means per voxel in metres, their planes, what it is called."""
 
     points: np.ndarray
     planes: Planes
     voxel_m: float
+    name: str = ""
 
     @classmethod
-    def of(cls, points: np.ndarray, config: Config) -> "Thinned":
-        """Of the points (N, 3) in range, thinned to the wanted voxel, to a smaller one in a small place."""
-        return cls(*Planes.in_range(points, config.preparation, config.ego.voxel_m))
+    def of(cls, points: np.ndarray, config: Config, name: str = "") -> "Thinned":
+        """Of the points (N, 3) in range, thinned to the wanted voxel, to a smaller one in a small place.
+
+        Raises DataError, which says whose points they are (`name`), where too few are left.
+        """
+        return cls(*Planes.in_range(points, config.preparation, config.ego.voxel_m, name), name)
 
     @classmethod
     def of_scan(cls, scan: Scan, config: Config) -> "Thinned":
-        """As `of`; DataError, which names the scan, where too few points are left."""
-        try:
-            return cls.of(scan.points, config)
-        except DataError as error:
-            raise DataError(f"{scan.name}: {error}") from None
+        """As `of`, called as the scan is."""
+        return cls.of(scan.points, config, scan.name)
 
 
 def find(source: Thinned, target: Thinned, guess: np.ndarray | None, config: EgoConfig) -> np.ndarray:
@@ -91,7 +92,8 @@ def register(
     if start is None:
         coarse_m = _COARSE_VOXELS * voxel_m
         target_from_source = robust_point_to_plane(
-            thinned(source.points, coarse_m), Planes.of(thinned(target.points, coarse_m), coarse_m),
+            thinned(source.points, coarse_m, source.name),
+            Planes.of(thinned(target.points, coarse_m, target.name), coarse_m),
             [_STAGES_VOXELS[0] * voxel_m], np.eye(4))
     reaches_m = [reach_voxels * voxel_m for reach_voxels in _STAGES_VOXELS[1:]]
     reaches_m = [reach_m for reach_m in reaches_m if reach_m <= start_off_m] or reaches_m[-1:]
@@ -109,8 +111,9 @@ def _require_overlap(source: Thinned, target: Thinned, target_from_source: np.nd
     found = overlap(source.points, target.planes.tree, reach_m, target_from_source) if is_rigid else 0.0
     if found < _MIN_OVERLAP:
         raise DataError(
-            f"ego-motion: {found:.0%} of the first scan comes within {reach_m:.2g} m of the second, at "
-            f"least {_MIN_OVERLAP:.0%} should; are these consecutive scans of one sensor?")
+            f"ego-motion: {found:.0%} of {source.name or 'the first scan'} comes within {reach_m:.2g} m of "
+            f"{target.name or 'the second'}, at least {_MIN_OVERLAP:.0%} should; are these consecutive scans "
+            "of one sensor?")
 
 
 def _overlap(source: Thinned, target: Thinned, target_from_source: np.ndarray) -> float:

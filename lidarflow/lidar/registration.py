@@ -38,21 +38,26 @@ def voxel_for(points: np.ndarray, wanted_m: float) -> float:
     return min(wanted_m, _SCENE_VOXEL_SHARE * scene_m)
 
 
-def thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
-    """Points (N, 3) averaged per voxel (M, 3); DataError where too few are left, or all are in one place."""
+def thinned(points: np.ndarray, voxel_m: float, name: str = "") -> np.ndarray:
+    """Points (N, 3) averaged per voxel (M, 3).
+
+    Raises DataError, which says whose points they are (`name`), where too few are left or all are in one
+    place.
+    """
     found = grid.means(points, voxel_m) if voxel_m > 0 else points
-    _require_enough(found, len(points), voxel_m)
+    _require_enough(found, len(points), voxel_m, name)
     return found
 
 
-def _require_enough(found: np.ndarray, count: int, voxel_m: float) -> None:
+def _require_enough(found: np.ndarray, count: int, voxel_m: float, name: str) -> None:
+    where = f"{name}: registration" if name else "registration"
     if len(found) < _MIN_POINTS:
         raise DataError(
-            f"registration: a scan has {count} points in range, {len(found)} after thinning to "
+            f"{where}: a scan has {count} points in range, {len(found)} after thinning to "
             f"{voxel_m:.2g} m, and registration needs {_MIN_POINTS}; is the scan complete and in metres, is "
             "preparation.min_range_m too large for the place?")
     if voxel_m <= 0:
-        raise DataError(f"registration: a scan of {count} points has no extent; do most lie at the sensor?")
+        raise DataError(f"{where}: a scan of {count} points has no extent; do most lie at the sensor?")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,16 +75,16 @@ class Planes:
 
     @classmethod
     def in_range(
-        cls, points: np.ndarray, limits: PreparationConfig, wanted_m: float
+        cls, points: np.ndarray, limits: PreparationConfig, wanted_m: float, name: str = ""
     ) -> "tuple[np.ndarray, Planes, float]":
         """Those in range of points (N, 3), thinned (M, 3); a cloud of these; and the voxel, as `voxel_for`.
 
-        Raises DataError where too few are left.
+        Raises DataError, which says whose points they are (`name`), where too few are left.
         """
         means, tree, normals, voxel_m, count = thinning.thinned(
             points, *preparation.range_limits_m(limits), wanted_m, _SCENE_VOXEL_SHARE,
             _NORMAL_RADIUS_VOXELS, _MIN_WIDTH_VOXELS)
-        _require_enough(means, count, voxel_m)
+        _require_enough(means, count, voxel_m, name)
         return means, cls(tree, normals), voxel_m
 
 
