@@ -1,4 +1,4 @@
-"""The command `lidarflow eval`: with cli.py it prints."""
+"""The command `lidarflow eval`, for cli.py."""
 
 from pathlib import Path
 from typing import Annotated
