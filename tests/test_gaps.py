@@ -132,7 +132,13 @@ def test_the_number_of_a_line_of_poses_is_that_of_the_scan(run, tmp_path):
 def test_a_target_without_flow_is_not_taken_from_behind_the_gap(lidarflow, run):
     made_of = provenance.read(run[0])
     provenance.write(run[0], replace(made_of, dataset=None))
-    lidarflow.ok("eval", "run", "--truth", made_of.dataset.folder / "sequences" / "00" / "truth")
+    truth = made_of.dataset.folder / "sequences" / "00" / "truth"
+    before = [pair["alignment"] for pair in json.loads((run[0] / "metrics.json").read_text())["pairs"]]
+    lidarflow.ok("eval", "run", "--truth", truth)
+    after = [pair["alignment"] for pair in json.loads((run[0] / "metrics.json").read_text())["pairs"]]
+    assert (after[0], after[2]) == (before[0], before[2]), "what the run recorded"
+    (run[0] / "metrics.json").unlink()
+    lidarflow.ok("eval", "run", "--truth", truth)
     pairs = json.loads((run[0] / "metrics.json").read_text())["pairs"]
     assert [pair["frame"] for pair in pairs] == list(NAMES)
     assert [pair["alignment"]["after"] is not None for pair in pairs] == [False, True, False]
