@@ -30,6 +30,15 @@ def test_a_folder_is_read_in_natural_order(tmp_path):
     assert "no scan -1" in message(data.scan, -1)
 
 
+def test_a_folder_of_clouds_has_the_truth_that_lies_in_it(tmp_path):
+    for number in (4, 5):
+        write_bin(tmp_path / f"{number:06d}.bin")
+    write_truth(tmp_path / "truth" / "000004.npz", len(POINTS))
+    data = open_dataset(tmp_path)
+    assert data.loader == "folder" and data.truth(0).flow.shape == POINTS.shape
+    assert data.truth(1) is None, "the last scan has no successor"
+
+
 def test_the_order_of_equal_numbers_and_of_digits_that_are_no_numbers_is_fixed():
     names = ["01.bin", "1.bin", "1²2.bin", "1²10.bin", "٢.bin"]
     for order in (names, names[::-1]):

@@ -22,7 +22,7 @@ class CloudFolder(ScanFiles):
 
     Times come from times.txt (seconds), from names that are nanoseconds, or seconds with a point, else 10 Hz
     is assumed. Poses come from ego_poses.txt or derived_ego_icp.txt (frame number, 3x4) or *poses_kitti.txt
-    (3x4), all of the sensor.
+    (3x4), all of the sensor. Truth lies in truth/<scan>.npz.
     """
 
     loader = "folder"
@@ -35,6 +35,10 @@ class CloudFolder(ScanFiles):
         self._poses, pose_notes = _read_poses(files[0].parent, files)
         super().__init__(folder_name(files[0].parent), files, times_ns, is_wanted(kitti_correction, is_kitti),
                          [*notes, *pose_notes, *_odd_sizes(files)])
+
+    def truth(self, index: int) -> Truth | None:
+        """Truth of truth/<scan>.npz where there is such a file."""
+        return self.stored_truth(self.files[0].parent / "truth", index)
 
     def world_from_sensor(self) -> np.ndarray | None:
         """Given poses (N, 4, 4), where a file beside the scans holds them."""
