@@ -176,8 +176,8 @@ class ObjectsConfig:
         0.2, "share of the points that an object's motion should leave unexplained by ego-motion that must "
         "be so, in either scan", low=0, high=1)
     min_observability: float = setting(
-        0.05, "mean squared cosine that an object's normals must have with its motion; 0 lets walls slide",
-        low=0, high=1)
+        0.05, "mean squared cosine that an object's normals must have with its motion, unless it clearly "
+        "goes on as before; 0 lets walls slide", low=0, high=1)
     max_shape_ratio: float = setting(
         0.4, "an object's own motion must bring its mean squared plane distance down to this share",
         low=0, high=1)

@@ -11,7 +11,7 @@ from lidarflow import pose, synthetic
 from lidarflow.config import ObjectsConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.kernels import grid, ground_plane, icp, links, tree
-from lidarflow.lidar import acceptance, evidence, frontend, objects, rigid_fit, seeds
+from lidarflow.lidar import acceptance, evidence, frontend, hypotheses, objects, rigid_fit, seeds
 from lidarflow.lidar import body as body_of
 from lidarflow.lidar import view as view_of_pair
 from lidarflow.lidar.body import Body
@@ -225,6 +225,31 @@ def test_a_wall_is_not_believed_to_slide_along_itself():
     assert not acceptance.moves(view, sliding, 0.1, CONFIG)
 
 
+def expected_at(view: view_of_pair.View, rows: np.ndarray, shift: list[float]) -> hypotheses.Expected:
+    """An object expected where `rows` of a view are, to move over ground by `shift`."""
+    return hypotheses.Expected(
+        tree.build(view.points[rows]), np.zeros(len(rows), np.int64), np.array([shift], float))
+
+
+def test_a_side_that_slides_is_believed_where_it_goes_on_as_before():
+    view = scene(np.array([0.0, 0.8, 0.0]), 14)
+    side, wall_rows = np.flatnonzero(view.points[:, 0] < 7.05), np.flatnonzero(view.points[:, 0] > 12.0)
+    sliding = Body(side, pose.from_translation([0.0, 0.8, 0.0]))
+    strict = replace(CONFIG, min_observability=0.1)     # some normals at its edges face the motion
+    assert acceptance.moves(view, sliding, 0.1, replace(CONFIG, min_observability=0.0))
+    assert not acceptance.moves(view, sliding, 0.1, strict)
+    assert acceptance.moves(view, sliding, 0.1, strict, expected_at(view, side, [0.0, 0.7, 0.0]))
+    for rows, shift in ((side, [0.0, 0.4, 0.0]), (side, [0.8, 0.0, 0.0]), (wall_rows, [0.0, 0.8, 0.0])):
+        assert not acceptance.moves(view, sliding, 0.1, strict, expected_at(view, rows, shift))
+
+
+def test_a_wall_does_not_slide_on_because_an_object_did():
+    view = scene(np.zeros(3), 13)
+    rows = np.flatnonzero(view.points[:, 0] > 12.0)
+    sliding = Body(rows, pose.from_translation([0.0, 0.5, 0.0]))
+    assert not acceptance.moves(view, sliding, 0.1, CONFIG, expected_at(view, rows, [0.0, 0.5, 0.0]))
+
+
 def test_leaves_that_hang_are_no_body():
     view = scene(np.array([0.6, 0.0, 0.0]), 16)
     rows = np.flatnonzero(view.points[:, 0] < 12.0)
@@ -409,3 +434,13 @@ def test_what_moves_in_argoverse_does_so_as_labelled():
     moving = truth.is_dynamic & truth.valid
     assert error_m[moving].mean() < 0.13 and result.is_dynamic[moving].mean() > 0.88
     assert result.is_dynamic[truth.valid & ~truth.is_dynamic].mean() < 0.002
+
+
+@needs_shared
+@pytest.mark.slow
+def test_a_car_that_passes_beside_the_sensor_moves_to_the_last():
+    dataset = open_dataset(SHARED / "kitti_raw_0048")
+    *_, before, last = (result for _, result in run(dataset, range(4, 8), FlowEstimator()))
+    car, same = (max(result.objects, key=lambda moving: moving.points) for result in (before, last))
+    assert same.id == car.id and same.points > 10_000
+    assert np.linalg.norm(same.velocity[:2] - car.velocity[:2]) < 1.0   # 10 cm a pair; as static it is 6 off

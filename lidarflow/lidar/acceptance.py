@@ -7,6 +7,7 @@ from lidarflow.config import ObjectsConfig
 from lidarflow.kernels import ground_plane, neighbours, tree, votes
 from lidarflow.lidar.body import Body, near_rows
 from lidarflow.lidar.evidence import tolerance
+from lidarflow.lidar.hypotheses import NONE, Expected, shifts_expected
 from lidarflow.lidar.surface import CAP_M, misfit_after
 from lidarflow.lidar.view import View
 from lidarflow.rows import lengths, mean, median
@@ -18,26 +19,32 @@ _SURROUNDINGS_M = 3.0
 _MIN_SURROUNDINGS = 100
 _CLEARLY_OFF = 1.5       # tolerances; at one, every other point is still explained by chance
 _GAIN_M = 0.01           # less is noise
+_AS_EXPECTED = 0.25      # share of its motion by which an object that goes on as before may be off
 _AROUND_M = 0.25   # target points this near to a moved body should be the body's
 
 
-def moves(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
+def moves(
+    view: View, body: Body, dt_s: float, config: ObjectsConfig, expected: Expected = NONE
+) -> bool:
     """Whether a body is fast enough, and its shape, its matches and the space it took all say that it moves.
 
     Each is deceived by something else: distances by leaves that flicker and by places seen anew, planes by
     walls along which any motion fits, matches by what looks alike.
     """
-    return seems_to_move(view, body, dt_s, config) and matches_agree(view, body, config)
+    return seems_to_move(view, body, dt_s, config, expected) and matches_agree(view, body, config)
 
 
-def seems_to_move(view: View, body: Body, dt_s: float, config: ObjectsConfig) -> bool:
+def seems_to_move(
+    view: View, body: Body, dt_s: float, config: ObjectsConfig, expected: Expected = NONE
+) -> bool:
     """Whether all but the matches, which cost most, says that a body moves."""
     points, moved, shift = _shifted(view, body)
     if np.hypot(shift[0], shift[1]) < config.min_speed_m_per_s * dt_s:
         return False
     # What costs most comes last.
     return (
-        _observability(view, body, shift) >= config.min_observability
+        (_observability(view, body, shift) >= config.min_observability
+         or _goes_on(view, body, moved, shift, expected, config))
         and min(_left_and_arrived(view, body, moved)) >= config.min_unexplained * _should_show(
             view, body, moved, shift, config)
         and _clearance(view, points) <= config.max_clearance_m
@@ -111,6 +118,21 @@ def _observability(view: View, body: Body, shift: np.ndarray) -> float:
     cosines = view.source.normals.take(body.rows, axis=0) @ (shift / np.linalg.norm(shift))
     cosines = cosines[np.isfinite(cosines)]
     return float((cosines**2).mean()) if len(cosines) else 0.0
+
+
+def _goes_on(
+    view: View, body: Body, moved: np.ndarray, shift: np.ndarray, expected: Expected,
+    config: ObjectsConfig,
+) -> bool:
+    """Whether a body does what an object that was there should do, and clearly left and arrived.
+
+    Of a car that passes beside the sensor little but its side is seen. Its motion is known from before, when
+    its front was; that something moves at all, which no wall tells, from the places that it left and took.
+    """
+    if min(_left_and_arrived(view, body, moved)) < config.min_unexplained:
+        return False
+    known = shifts_expected(tree.build(view.points.take(body.rows, axis=0)), expected)
+    return any(np.linalg.norm(shift - one) <= _AS_EXPECTED * np.linalg.norm(one) for one in known)
 
 
 def _left_and_arrived(view: View, body: Body, moved: np.ndarray) -> tuple[float, float]:

@@ -40,7 +40,7 @@ def translations(
     """Translations over ground (3,), metres, of the seeds at `rows` (K,), whose planes tell shifts (K, 3)."""
     points = view.points[rows]
     body = tree.build(points)
-    return [*_of_planes(shift), *_of_expected(body, expected),
+    return [*_of_planes(shift), *shifts_expected(body, expected),
             *_of_votes(view, points, body, max_shift_m)]
 
 
@@ -57,8 +57,8 @@ def _of_planes(shift: np.ndarray) -> list[np.ndarray]:
     return [votes.median(known)] if len(known) >= _MIN_SHIFTED else []
 
 
-def _of_expected(body: Tree, expected: Expected) -> list[np.ndarray]:
-    """The shifts of the expected objects that these points may be on."""
+def shifts_expected(body: Tree, expected: Expected) -> list[np.ndarray]:
+    """The shifts over ground (3,), metres, of the expected objects that a tree's points may be on."""
     near = neighbours.near_rows(expected.points, body, _EXPECTED_RADIUS_M)
     return list(expected.shifts[np.unique(expected.number[near])])
 

@@ -30,7 +30,8 @@ def find(
     """The moving objects of a view, sought at seeds; no point belongs to two, the best supported come first.
 
     `expected` is what earlier pairs lead to expect: it is looked for where it should be, and believed no
-    more easily than the rest. `each` judges candidates, several at a time if it can.
+    more easily than the rest, but that its surface need not face its motion where it clearly goes on as
+    before. `each` judges candidates, several at a time if it can.
     """
     least_m = _least_shift_m(dt_s, config)
     starts = _best_starts(view, found, found.clusters, expected, least_m)
@@ -39,7 +40,7 @@ def find(
     moving = [number for number, start in enumerate(starts) if start is not None]
     alone = dict(zip(moving, _candidates(
         view, [found.rows[found.clusters[number]] for number in moving],
-        [starts[number] for number in moving], free, dt_s, config, each), strict=True))
+        [starts[number] for number in moving], free, dt_s, config, expected, each), strict=True))
     taken = np.empty(0, np.int64)
     for number, (cluster, start) in enumerate(zip(found.clusters, starts, strict=True)):
         mine = cluster[free[found.rows[cluster]]]
@@ -49,7 +50,7 @@ def find(
             continue
         candidate = alone.get(number)
         if candidate is None or len(mine) < len(cluster) or candidate.asked[taken].any():
-            candidate, = _candidates(view, [found.rows[mine]], [start], free, dt_s, config, each)
+            candidate, = _candidates(view, [found.rows[mine]], [start], free, dt_s, config, expected, each)
         if candidate.body is not None:
             bodies.append(candidate.body)
             free[candidate.body.rows] = False
@@ -59,17 +60,17 @@ def find(
 
 def _candidates(
     view: View, seeds: list[np.ndarray], starts: list[np.ndarray], free: np.ndarray, dt_s: float,
-    config: ObjectsConfig, each: Each,
+    config: ObjectsConfig, expected: hypotheses.Expected, each: Each,
 ) -> list[Growth]:
     """What grows of seeds, rows (K,) each, over the rows that are `free` (N,), and moves."""
     grown = body.grown(view, seeds, starts, free, _least_shift_m(dt_s, config), config)
-    grown = _those(grown, lambda own: seems_to_move(view, own, dt_s, config), each)
+    grown = _those(grown, lambda own: seems_to_move(view, own, dt_s, config, expected), each)
     _match_at_once(view, grown)
     grown = _those(grown, lambda own: matches_agree(view, own, config), one_by_one)
     grown = each(lambda growth: body.completed(view, growth, free), grown)
     _match_at_once(view, grown)
     # What a body surrounds must not speak against it.
-    return _those(grown, lambda own: moves(view, own, dt_s, config), each)
+    return _those(grown, lambda own: moves(view, own, dt_s, config, expected), each)
 
 
 def _those(growths: list[Growth], holds: Callable[[Body], bool], each: Each) -> list[Growth]:
