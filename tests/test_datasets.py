@@ -81,6 +81,17 @@ def test_seconds_in_names_are_exact():
     assert times_from_names([Path("99999999999.5.pcd"), Path("99999999999.6.pcd")]) == [], "not 64 bits"
 
 
+@pytest.mark.parametrize("times, apart", [
+    ("0\n100\n200\n", "100 s"), ("0\n1e8\n2e8\n", "1e+08 s"), ("0\n2\n4\n", None),
+    ("0\n0.1\n90\n90.1\n", None)])
+def test_times_that_may_not_be_seconds_are_said(tmp_path, times, apart):
+    for number in range(len(times.split())):
+        write_bin(tmp_path / f"{number}.bin")
+    (tmp_path / "times.txt").write_text(times)
+    expected = "" if apart is None else f"scans are {apart} apart by their times; are those seconds?"
+    assert open_dataset(tmp_path).note == expected
+
+
 @pytest.mark.parametrize("pair", [("1.bin", "1.BIN"), ("Scan1.bin", "scan1.bin")])
 def test_scans_whose_results_would_share_a_file_are_refused(tmp_path, pair):
     for name in (*pair, "01.bin"):

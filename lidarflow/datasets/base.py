@@ -15,6 +15,7 @@ from lidarflow.errors import DataError
 from lidarflow.types import Scan, Truth
 
 _PERIOD_NS = 100_000_000     # of 10 Hz
+_MOST_APART_S = 10.0     # scans that show the same places; more are times in another unit
 _EARLIEST_S, _LATEST_S = 10**8, 9 * 10**9     # what a stamp may be; 64-bit nanoseconds end at 9.2e9 s
 TRUTH_ARRAYS = ("flow", "valid", "dynamic", "track", "target_from_source")
 _ARRAY_OF = {"ego_motion": "target_from_source", "is_dynamic": "dynamic", "object_id": "track"}
@@ -77,7 +78,7 @@ class ScanFiles:
         self.correct = correct
         assumed = ["KITTI vertical-angle correction on"] if correct else []
         assumed += [] if known_ns else ["10 Hz assumed"]
-        self.note = "; ".join([*assumed, *notes])
+        self.note = "; ".join([*assumed, *notes, *_far_apart(known_ns)])
 
     def __len__(self) -> int:
         return len(self.files)
@@ -111,6 +112,14 @@ class ScanFiles:
 
     def _read(self, file: Path) -> np.ndarray:
         return clouds.read_points(file)
+
+
+def _far_apart(times_ns: Sequence[int]) -> list[str]:
+    """A note where increasing times are so far apart that they may not be what they are taken for."""
+    apart_s = float(np.median(np.diff(np.array(times_ns, np.int64)))) * 1e-9 if len(times_ns) > 1 else 0.0
+    if apart_s <= _MOST_APART_S:
+        return []
+    return [f"scans are {apart_s:.6g} s apart by their times; are those seconds?"]
 
 
 def check_index(dataset: Dataset, index: int) -> None:
