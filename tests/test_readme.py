@@ -11,6 +11,7 @@ from shared_data import ROOT
 
 from lidarflow import synthetic, viewer
 from lidarflow.config import read_toml
+from lidarflow.datasets.clouds import _READERS
 from lidarflow.export import FORMATS
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -78,3 +79,9 @@ def test_every_format_and_every_extra_is_named():
     project = read_toml(ROOT / "pyproject.toml")["project"]
     for extra in project["optional-dependencies"].keys() - {"dev"}:
         assert re.search(rf"[`\[]{extra}[`\]]", README), extra
+
+
+def test_the_clouds_that_can_be_read_and_their_axes_are_told():
+    told, = re.findall(r"^Clouds may be (.*?); data sets are", README, re.MULTILINE | re.DOTALL)
+    assert set(_READERS) <= set(re.findall(r"\.[a-z]+\b", told))
+    assert "in metres, with z up" in told
