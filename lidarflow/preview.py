@@ -26,20 +26,25 @@ def bird_eye(points: np.ndarray, colours: np.ndarray, is_dynamic: np.ndarray, re
     scale = size_px / (2.0 * half_width_m)
     pixels = np.full((size_px, size_px, 3), colour.BACKGROUND, np.uint8)
     _scatter(pixels, points[~is_dynamic], colours[~is_dynamic], scale, dot_px=max(1, size_px // 1000))
-    _scatter(pixels, points[is_dynamic], colours[is_dynamic], scale, dot_px=max(2, size_px // 240))
+    if arrows is None:
+        arrows = _arrows_of_groups(points, residual_flow, is_dynamic, dt_s)
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image)
     _draw_sensor(draw, scale, size_px)
-    if arrows is None:
-        tops, moved = colour.moving_objects(points, residual_flow, is_dynamic)
-        arrows = tops, moved / dt_s
-    _draw_arrows(draw, *arrows, scale, size_px)
     _draw_scale_bar(draw, scale, size_px)
     if legend is None:
         legend = Image.fromarray(colour.wheel(size_px // 4))
     image.paste(legend, (size_px - legend.width, 0))
     margin = size_px // 50
     draw.text((margin, margin), caption, _TEXT, colour.font(size_px / 50))
+    if len(arrows[0]):
+        draw.text((margin, 2.5 * margin), "arrows: the way in 1 s", _QUIET, colour.font(size_px / 60))
+
+    # What moves comes last: neither legend nor text nor scale may hide it.
+    pixels = np.array(image)
+    _scatter(pixels, points[is_dynamic], colours[is_dynamic], scale, dot_px=max(2, size_px // 240))
+    image = Image.fromarray(pixels)
+    _draw_arrows(ImageDraw.Draw(image), *arrows, scale, size_px)
     return image
 
 
@@ -54,24 +59,35 @@ def motion_picture(source: Scan, result: FlowResult, dt_s: float, size_px: int =
     residual_flow = result.residual_flow(points)
     colours = colour.scene_colours(points, residual_flow, result.is_dynamic, dt_s)
     caption = f"{source.name}: {int(result.is_dynamic.sum())} of {len(points)} points move over ground"
-    return bird_eye(points, colours, result.is_dynamic, residual_flow, half_width_m=half_width(points),
-                    size_px=size_px, dt_s=dt_s, caption=caption, arrows=_arrows_of(result))
+    arrows = (_arrows_of_objects(result) if result.objects
+              else _arrows_of_groups(points, residual_flow, result.is_dynamic, dt_s))
+    return bird_eye(points, colours, result.is_dynamic, residual_flow, dt_s=dt_s, size_px=size_px,
+                    half_width_m=half_width(points, arrows), caption=caption, arrows=arrows)
 
 
-def _arrows_of(result: FlowResult) -> tuple[np.ndarray, np.ndarray] | None:
-    """Middles (K, 3) in metres and velocities (K, 3) in m/s of the objects, source frame; None if none."""
-    if not result.objects:
-        return None
+def _arrows_of_objects(result: FlowResult) -> tuple[np.ndarray, np.ndarray]:
+    """Middles (K, 3) in metres and velocities (K, 3) in m/s of the objects, source frame."""
     velocity = np.stack([found.velocity for found in result.objects])
     middles = np.stack([found.box_centre for found in result.objects])
     return middles, pose.turn(pose.inverse(result.ego_motion), velocity)
 
 
-def half_width(points: np.ndarray) -> float:
-    """Half of the picture's width in metres: most of the scan, at most 40 m."""
+def _arrows_of_groups(points: np.ndarray, residual_flow: np.ndarray, is_dynamic: np.ndarray, dt_s: float
+                      ) -> tuple[np.ndarray, np.ndarray]:
+    """Tops (K, 3) in metres and velocities (K, 3) in m/s of groups of moving points, source frame."""
+    tops, moved = colour.moving_objects(points, residual_flow, is_dynamic)
+    return tops, moved / dt_s
+
+
+def half_width(points: np.ndarray, arrows: tuple[np.ndarray, np.ndarray] | None = None) -> float:
+    """Half of the picture's width in metres: most of the scan, at most 40 m, or more to hold all arrows."""
     reach_m = np.hypot(points[:, 0], points[:, 1])
     reach_m = reach_m[np.isfinite(reach_m)]
-    return float(np.clip(1.3 * np.quantile(reach_m, 0.95), 4.0, 40.0)) if len(reach_m) else 40.0
+    width_m = float(np.clip(1.3 * np.quantile(reach_m, 0.95), 4.0, 40.0)) if len(reach_m) else 40.0
+    if arrows is None or not len(arrows[0]):
+        return width_m
+    ends = np.concatenate([arrows[0], arrows[0] + arrows[1]])[:, :2]
+    return max(width_m, 1.1 * float(np.abs(ends).max()))
 
 
 def _to_pixel(points: np.ndarray, scale: float, size_px: int) -> np.ndarray:
@@ -120,7 +136,8 @@ def _draw_arrow(draw: ImageDraw.ImageDraw, start: np.ndarray, tip: np.ndarray, s
     if length_px < 1:
         return
     along = (tip - start) / length_px
-    across, head = np.array([-along[1], along[0]]), size_px / 90.0
+    # A head longer than half of the way would hide what goes slowly.
+    across, head = np.array([-along[1], along[0]]), min(size_px / 90.0, 0.5 * length_px)
     neck = tip - along * head
     draw.line([tuple(start), tuple(neck)], fill=colour.ARROW, width=max(2, size_px // 400))
     draw.polygon([tuple(tip), tuple(neck + across * head * 0.5), tuple(neck - across * head * 0.5)],
@@ -134,7 +151,8 @@ def _label_arrow(draw: ImageDraw.ImageDraw, tip: np.ndarray, speed_m_per_s: floa
     for x, y, anchor in ((-1, 0, "rm"), (1, 0, "lm"), (0, -1, "mb"), (0, 1, "mt")):
         place = (tip[0] + x * gap, tip[1] + y * gap)
         box = draw.textbbox(place, text, font, anchor)
-        if not any(_overlap(box, other) for other in taken):
+        within = min(box[:2]) >= 0 and max(box[2:]) <= size_px
+        if within and not any(_overlap(box, other) for other in taken):
             taken.append(box)
             draw.text(place, text, colour.ARROW, font, anchor, stroke_width=2, stroke_fill=colour.BACKGROUND)
             return

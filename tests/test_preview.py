@@ -76,3 +76,38 @@ def test_a_still_and_empty_scene_can_be_drawn():
     empty = np.empty((0, 3))
     picture = preview.bird_eye(empty, empty.astype(np.uint8), np.empty(0, bool), empty, size_px=200)
     assert picture.size == (200, 200)
+
+
+def moving_block(x, y):
+    """Points of a block around (x, y) that moves forward by 0.5 m in 0.1 s, and what is drawn of them."""
+    points = np.random.default_rng(4).uniform(-1.5, 1.5, (400, 3)) + (x, y, 0)
+    moved, is_dynamic = np.tile([0.5, 0.0, 0.0], (400, 1)), np.ones(400, bool)
+    return points, colour.scene_colours(points, moved, is_dynamic, 0.1), is_dynamic, moved
+
+
+@pytest.mark.parametrize(("x", "y"), [(-38.5, 34.0), (30.0, -30.0), (38.0, 30.0)],
+                         ids=["scale bar", "legend", "caption"])
+def test_nothing_hides_what_moves(x, y):
+    block = moving_block(x, y)
+    nowhere = np.zeros((0, 3)), np.zeros((0, 3))
+    picture = np.asarray(preview.bird_eye(*block, size_px=600, caption="0" * 30, arrows=nowhere)).astype(int)
+    column, row = np.floor(300 - block[0][:, [1, 0]].T * 7.5 - 0.5).astype(int)
+    shown = picture[row, column]
+    assert (shown == block[1][0]).all()
+
+
+def test_an_object_far_away_is_in_the_picture():
+    points, _, is_dynamic, moved = moving_block(10.0, -70.0)
+    arrows = preview._arrows_of_groups(points, moved, is_dynamic, 0.1)
+    near = np.random.default_rng(5).uniform(-20.0, 20.0, (5000, 3))
+    assert preview.half_width(near) <= 40.0
+    assert 70.0 < preview.half_width(near, arrows) < 90.0
+
+
+def test_the_picture_says_how_long_arrows_are_if_there_are_any():
+    block = moving_block(0.0, 20.0)
+    text = np.s_[28:50, 10:250]
+    none = np.zeros((0, 3)), np.zeros((0, 3))
+    with_arrows, without = (np.asarray(preview.bird_eye(*block, size_px=600, arrows=arrows))[text]
+                            for arrows in (None, none))
+    assert with_arrows.max() > 120 > without.max()
