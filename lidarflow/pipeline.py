@@ -20,6 +20,7 @@ from lidarflow.lidar import (
     frontend,
     limbs,
     mesh,
+    odometry,
     preparation,
     refinement,
     start,
@@ -94,7 +95,7 @@ class FlowEstimator:
 
     def reset(self) -> None:
         """Begin anew with the next scan; numbers of objects go on."""
-        self._odometry = ego.odometry(self.config)
+        self._odometry = odometry.begun(self.config)
         self._scan: Scan | None = None
         self._previous: Previous | None = None
         self.tracks = Tracks(next_id=self.tracks.next_id)
@@ -133,7 +134,7 @@ class FlowEstimator:
     def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
         """Take `known` for the flow from the last scan to this one; only odometry sees the scan again."""
         last, self._previous = self._scan, None
-        ego.follow(self._odometry, last, scan, known)
+        odometry.follow(self._odometry, last, scan, known)
         if last is not None and known is not None:
             self._previous = Previous(last.points, known, ScanPair(last, scan).dt_s)
         self._scan, self.tracks = scan, tracks

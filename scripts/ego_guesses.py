@@ -14,13 +14,13 @@ import numpy as np
 from lidarflow import pose, runner
 from lidarflow.config import Config
 from lidarflow.datasets import open_dataset
-from lidarflow.lidar import ego
+from lidarflow.lidar import ego, odometry
 
 
 def compared(folder: Path, n_scans: int | None) -> dict[str, np.ndarray]:
     """By what is compared, (N, 2) metres and degrees off."""
     config, dataset = Config(), open_dataset(folder)
-    last_motion, kiss_icp = ego.LastMotion(), ego.KissIcp(config)
+    last_motion, kiss_icp = odometry.LastMotion(), odometry.KissIcp(config)
     before, found = None, []
     frames = runner.choose_frames(dataset, 0, n_scans)
     for frame in frames:

@@ -14,7 +14,7 @@ from lidarflow.baselines import ransac
 from lidarflow.config import Config, EgoConfig, load, to_dict, updated
 from lidarflow.datasets import open_dataset
 from lidarflow.errors import ConfigError, DataError
-from lidarflow.lidar import ego, features, matching
+from lidarflow.lidar import features, matching, odometry
 from lidarflow.types import FlowResult, Scan, ScanPair
 
 NAMES = tuple(name for name in methods.METHODS if name != methods.OURS)
@@ -187,8 +187,8 @@ def test_a_sequence_is_its_pairs(name):
 def test_ego_is_registration_or_kiss_icp_along_a_sequence():
     settings = [EgoConfig(), EgoConfig(method="kiss_icp"), EgoConfig(method="kiss_icp", refine=False)]
     registered, refined, alone = (stepped("ego", replace(Config(), ego=ego)) for ego in settings)
-    odometry = ego.KissIcp(Config())
-    by_kiss_icp = [odometry.step(scan.points, 0.1) for scan, _ in drive()]
+    kiss_icp = odometry.KissIcp(Config())
+    by_kiss_icp = [kiss_icp.step(scan.points, 0.1) for scan, _ in drive()]
     for (_, truth), one, other, coarse, kiss in zip(
             drive(), registered[1:], refined[1:], alone[1:], by_kiss_icp[1:], strict=False):
         assert_allclose(coarse.ego_motion, kiss, atol=1e-6)

@@ -14,7 +14,7 @@ from lidarflow.config import Config, EgoConfig, ObjectsConfig, PreparationConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.datasets.clouds import read_points
 from lidarflow.errors import DataError, LidarflowError
-from lidarflow.lidar import ego, frontend, registration, start
+from lidarflow.lidar import ego, frontend, odometry, registration, start
 from lidarflow.pipeline import FlowEstimator, estimate_flow
 from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
@@ -434,7 +434,7 @@ def ego_motion_of(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def test_the_last_motion_goes_on_for_as_long_as_the_next_pair_takes():
-    guess, motion = ego.LastMotion(), pose.exp(np.array([0.0, 0.0, 0.04, 0.8, 0.02, 0.0]))
+    guess, motion = odometry.LastMotion(), pose.exp(np.array([0.0, 0.0, 0.04, 0.8, 0.02, 0.0]))
     assert guess.step(np.empty((0, 3)), 0.0) is None
     guess.found(motion, 0.1)
     assert guess.step(np.empty((0, 3)), 0.1) is motion

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from lidarflow.baselines.whole_scan import Registered, WholeScan
-from lidarflow.lidar import ego
+from lidarflow.lidar import ego, odometry
 from lidarflow.lidar.features import Masks
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.types import FlowResult, Scan
@@ -27,7 +27,7 @@ class Ego(WholeScan):
     def reset(self) -> None:
         """Begin anew with the next scan."""
         super().reset()
-        self._odometry = ego.odometry(self.config)
+        self._odometry = odometry.begun(self.config)
 
     def step(self, scan: Scan) -> FlowResult | None:
         """Flow from the last scan to this one; None for the first, and for one after a scan of no use."""
@@ -38,7 +38,7 @@ class Ego(WholeScan):
 
     def follow(self, scan: Scan, known: FlowResult | None, tracks: Tracks) -> None:
         """Take the flow to this scan for known; KISS-ICP sees the scan again."""
-        ego.follow(self._odometry, self._previous[0] if self._previous else None, scan, known)
+        odometry.follow(self._odometry, self._previous[0] if self._previous else None, scan, known)
         super().follow(scan, known, tracks)
 
     def _prepare(self, scan: Scan) -> _Prepared:
