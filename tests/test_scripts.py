@@ -65,6 +65,11 @@ def test_open_places():
     assert found.count("\n") == 14 and "| HDL-32E | 8 | 1 | 0 | 0 | 0.0" in found
 
 
+def test_far_apart():
+    found = printed("far_apart", "--seeds", 1, "--pairs", 1)
+    assert found.count("\n") == 12 and "| 8.0 m | 1 | " in found and "| 69° | 1 | 1 | 0 | " in found
+
+
 def test_ego_guesses(street):
     found = printed("ego_guesses", street)
     name, pairs, median_m, *_ = row(found, "street3")

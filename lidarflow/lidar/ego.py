@@ -1,6 +1,6 @@
 """Ego-motion: the rigid motion of the static world between two scans."""
 
-import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from lidarflow import pose
 from lidarflow.config import Config, EgoConfig
 from lidarflow.errors import DataError
+from lidarflow.lidar import wide_search
 from lidarflow.lidar.registration import (
     Planes,
     overlap,
@@ -24,6 +25,10 @@ _COARSE_VOXELS = 5.0         # the first stage works on a cloud thinned this muc
 _GUESS_OFF_M = 0.6           # a guess is nearer than this: a sensor at 10 Hz gains 0.1 m at 10 m/s²
 _SURPRISE_M = 0.3            # a guess farther off than this, or turned more, is looked at twice
 _SURPRISE_RAD = 0.03
+_SAME_M = 0.02               # registrations that end nearer to one another agree
+_SAME_RAD = 0.002
+_SURELY_MEETS = 0.2          # within the last reach: scans of two places were brought together by up to 0.17
+_CLEARLY_MORE = 0.04         # of the source within the fourth reach: 0.06 to 0.22 when rest led nowhere
 _USUAL_OVERLAP = 0.5         # within the last reach: 0.6 to 0.9 of dense scans that lie right, less if not
 _MIN_OVERLAP = 0.3           # of the source within the third stage's reach of the target, at the end
 
@@ -54,27 +59,76 @@ class Thinned:
 def find(source: Thinned, target: Thinned, guess: np.ndarray | None, config: EgoConfig) -> np.ndarray:
     """target_from_source (4, 4), as the settings want it.
 
-    It is the registration that begins at the guess, or wide without one. Where the guess turns out to be far
-    off, or little of the source to meet the target, a wide one is tried too, and the better taken. Raises
-    DataError when the clouds have too little in common.
+    It is the registration that begins at the guess. Without one, or where it turns out to be far off, or
+    little of the source to meet the target, one begins at rest and wide, and where little meets then either,
+    and the two do not agree, one all around; that by which more meets is taken. Raises DataError when
+    the clouds have too little in common.
     """
-    if guess is None:
-        return reproducible(register(source, target))
-    if config.method == "kiss_icp" and not config.refine:
+    if guess is not None and config.method == "kiss_icp" and not config.refine:
         return reproducible(guess)
-    found, share = None, 0.0
-    with contextlib.suppress(DataError):
-        found = register(source, target, guess, _GUESS_OFF_M)
-        share = _overlap(source, target, found)
-        if share >= _USUAL_OVERLAP and not _is_far_off(guess, found):
-            return reproducible(found)
+    best = None
+    if guess is not None:
+        best = _found(source, target, lambda: register(source, target, guess, _GUESS_OFF_M))
+        if best.share >= _USUAL_OVERLAP and not _is_far_off(guess, best.motion):
+            return reproducible(best.motion)
+    from_rest = _found(source, target, lambda: register(source, target))
+    is_settled = best is not None and _agree(best, from_rest)
+    best = from_rest if best is None else best.or_better(from_rest)
+    if best.share < _USUAL_OVERLAP and not is_settled:
+        best = _or_all_around(source, target, best)
+    if best.refusal:
+        raise best.refusal
+    return reproducible(best.motion)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """What a registration found: the motion (4, 4) and the share of the source that meets the target by it.
+
+    Where it was refused, the identity, nothing, and why.
+    """
+
+    motion: np.ndarray
+    share: float
+    refusal: DataError | None = None
+
+    def or_better(self, other: "_Found") -> "_Found":
+        """The other one where it was not refused and more meets by it."""
+        is_better = other.refusal is None and (self.refusal or other.share > self.share)
+        return other if is_better else self
+
+
+def _found(source: Thinned, target: Thinned, registration: Callable[[], np.ndarray]) -> _Found:
     try:
-        wide = register(source, target)
-    except DataError:
-        if found is None:
-            raise
-        return reproducible(found)
-    return reproducible(wide if found is None or _overlap(source, target, wide) > share else found)
+        motion = registration()
+    except DataError as error:
+        return _Found(pose.identity(), 0.0, error)
+    return _Found(motion, _overlap(source, target, motion))
+
+
+def _agree(one: _Found, other: _Found) -> bool:
+    """Whether two registrations that began apart came to the same place."""
+    return bool(
+        not one.refusal and not other.refusal
+        and pose.translation_distance(one.motion, other.motion) < _SAME_M
+        and pose.rotation_distance(one.motion, other.motion) < _SAME_RAD)
+
+
+def _or_all_around(source: Thinned, target: Thinned, best: _Found) -> _Found:
+    """What is found from the best of many starts, if clearly more meets by it than by the best so far."""
+
+    def registration() -> np.ndarray:
+        start = wide_search.best_start(
+            source.points, target.points, _COARSE_VOXELS * target.voxel_m, _STAGES_VOXELS[0] * target.voxel_m)
+        return register(source, target, start)
+
+    found = _found(source, target, registration)
+    if found.share < _SURELY_MEETS:
+        return best
+    # Wider than the last reach: rings travel with the sensor, and meet by whatever is nearly rest.
+    by_found, by_best = (
+        _overlap(source, target, one.motion, _STAGES_VOXELS[3]) for one in (found, best))
+    return found if best.refusal or by_found > by_best + _CLEARLY_MORE else best
 
 
 def register(
@@ -114,10 +168,11 @@ def _require_overlap(source: Thinned, target: Thinned, target_from_source: np.nd
             "of one sensor?")
 
 
-def _overlap(source: Thinned, target: Thinned, target_from_source: np.ndarray) -> float:
-    """Share of the source that comes within the last stage's reach of the target."""
-    return overlap(
-        source.points, target.planes.tree, _STAGES_VOXELS[-1] * target.voxel_m, target_from_source)
+def _overlap(
+    source: Thinned, target: Thinned, target_from_source: np.ndarray, reach_voxels: float = _STAGES_VOXELS[-1]
+) -> float:
+    """Share of the source that comes within a reach of the target, that of the last stage."""
+    return overlap(source.points, target.planes.tree, reach_voxels * target.voxel_m, target_from_source)
 
 
 def _is_far_off(guess: np.ndarray, found: np.ndarray) -> bool:
