@@ -16,7 +16,7 @@ from lidarflow.lidar.surface import CAP_M, MIN_AGREEMENT, Misfit
 from lidarflow.lidar.view import View
 from lidarflow.types import MovingObject
 
-_MAX_SHIFT_M = 3.0        # over ground and between scans: 30 m/s at 10 Hz
+_MAX_SPEED_M_PER_S = 30.0  # over ground
 _MAX_START_RATIO = 0.55  # of the squared misfit that ego-motion leaves; moving objects begin below 0.45
 _MIN_START_SPEED = 0.5   # share of the least speed; points that follow the rings make a start too slow
 _DISTANCE_WEIGHT = 0.3   # of squared distances to points, where those to planes have 1
@@ -33,8 +33,7 @@ def find(
     more easily than the rest, but that its surface need not face its motion where it clearly goes on as
     before. `each` judges candidates, several at a time if it can.
     """
-    least_m = _least_shift_m(dt_s, config)
-    starts = _best_starts(view, found, found.clusters, expected, least_m)
+    starts = _best_starts(view, found, found.clusters, expected, dt_s, config)
     bodies, free = [], np.ones(len(view.points), bool)
     # All are looked at as if each were alone; who meets what another has taken is looked at again.
     moving = [number for number, start in enumerate(starts) if start is not None]
@@ -45,7 +44,7 @@ def find(
     for number, (cluster, start) in enumerate(zip(found.clusters, starts, strict=True)):
         mine = cluster[free[found.rows[cluster]]]
         if len(mine) < len(cluster):
-            start, = _best_starts(view, found, (mine,), expected, least_m)
+            start, = _best_starts(view, found, (mine,), expected, dt_s, config)
         if start is None:
             continue
         candidate = alone.get(number)
@@ -105,19 +104,19 @@ def describe(
 
 def _best_starts(
     view: View, found: seeds.Seeds, clusters: tuple[np.ndarray, ...],
-    expected: hypotheses.Expected, least_m: float,
+    expected: hypotheses.Expected, dt_s: float, config: ObjectsConfig,
 ) -> list[np.ndarray | None]:
     """For each cluster of seeds, the motion (4, 4) that explains it best, from what is proposed for it.
 
     None where there are too few seeds, none explains them clearly better than ego-motion does, or the one
-    that does moves them less than `least_m` along the ground.
+    that does moves them too little along the ground to be looked at further.
     """
     chosen = [hypotheses.spread(cluster, _MAX_START_POINTS) for cluster in clusters]
     rows = [found.rows[cluster] for cluster in chosen]
     proposed = [
         (number, translation) for number, cluster in enumerate(chosen) if len(cluster) >= seeds.MIN_SEEDS
         for translation in hypotheses.translations(
-            view, rows[number], found.shift[cluster], expected, _MAX_SHIFT_M)]
+            view, rows[number], found.shift[cluster], expected, _MAX_SPEED_M_PER_S * dt_s)]
     if not proposed:
         return [None] * len(clusters)
     fits = rigid_fit.onto([view.points[own] for own in rows], proposed, view.upright.tree)
@@ -130,7 +129,7 @@ def _best_starts(
         mine = np.flatnonzero(group == number)
         if len(mine) and left_sq[mine].min() <= _MAX_START_RATIO * _misfit_sq(view.by_ego[own]):
             start = fits[mine[np.argmin(left_sq[mine])]]
-            if _along_ground_m(view.points[own].mean(axis=0), start) >= least_m:
+            if _along_ground_m(view.points[own].mean(axis=0), start) >= _least_shift_m(dt_s, config):
                 best[number] = start
     return best
 
