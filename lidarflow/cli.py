@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from lidarflow import __version__
+from lidarflow import __version__, interrupts
 from lidarflow.errors import DataError, LidarflowError
 from lidarflow.eval_cli import evaluate
 from lidarflow.export_cli import export
@@ -57,7 +57,9 @@ def main() -> None:
     """Entry point: problems with data or settings become one line and exit code 1."""
     # A terminal that lacks a letter shows another one; that is no reason to lose the results.
     sys.stdout.reconfigure(errors="replace")
-    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGTERM, interrupts.deferred(_terminate))
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:     # in the background it is ignored
+        signal.signal(signal.SIGINT, interrupts.deferred(signal.default_int_handler))
     try:
         _check_words(sys.argv[1:])
         app(prog_name="lidarflow")

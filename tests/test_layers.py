@@ -9,7 +9,7 @@ from shared_data import ROOT
 PACKAGE = ROOT / "lidarflow"
 LAYERS = [
     {"errors", "__version__"},
-    {"aside", "open3d_import", "pose", "robust", "rows", "colour", "kernels", "silence", "stopwatch"},
+    {"aside", "open3d_import", "pose", "robust", "rows", "colour", "kernels", "interrupts", "silence", "stopwatch"},
     {"checks", "rgbd_colour"},    # they use pose, and colour
     {"types", "rgbd_types"},
     {"config"},

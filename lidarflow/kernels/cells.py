@@ -33,7 +33,12 @@ class Cells(NamedTuple):
 
 def build(points: np.ndarray, cell_m: float) -> Cells:
     """The cells of finite points (N, 3), in the order they first appear."""
-    return built(np.ascontiguousarray(points, float), float(cell_m))
+    return Cells(*_built(np.ascontiguousarray(points, float), float(cell_m)))
+
+
+@njit()
+def _built(points, cell_m):
+    return built(points, cell_m)[:]
 
 
 @njit()

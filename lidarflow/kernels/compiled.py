@@ -3,6 +3,9 @@
 numba's cache watches a function's own file only: after an update it would go on using code with other files'
 old functions inside, and two versions of numba that share a cache make each other compile anew every time.
 The cache therefore has a folder for each state of the sources and version of numba.
+
+Kernels that Python calls return plain tuples: a named one is made by Python, which looks for signals then, so
+that Ctrl-C would crash the process.
 """
 
 import hashlib

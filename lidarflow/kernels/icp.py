@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from numba.extending import register_jitable
 
 from lidarflow.kernels import queue
 from lidarflow.kernels import tree as trees
@@ -37,7 +38,7 @@ class Nearest(NamedTuple):
     clear_m: np.ndarray
 
 
-@njit()
+@register_jitable
 def nothing_known(count):
     """Nearest places of so many points before any is searched for."""
     return Nearest(np.full(count, -1), np.zeros((count, 3)), np.full(count, -np.inf))

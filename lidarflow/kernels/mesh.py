@@ -52,9 +52,18 @@ def ring_edges(
     return _ring_edges(grid, wanted, limits)
 
 
-@njit()
-def scan_grid(points, azimuth, order, bounds):
+def scan_grid(points: np.ndarray, azimuth: np.ndarray, order: np.ndarray, bounds: np.ndarray) -> ScanGrid:
     """The ScanGrid of some of the points (N, 3): `order` (P,) lists them, `bounds` (R + 1,) are its rings."""
+    return ScanGrid(*_scan_grid(points, azimuth, order, bounds))
+
+
+def part(grid: ScanGrid, kept: np.ndarray) -> ScanGrid:
+    """The ScanGrid of the `kept` (P,) points alone; rings may be empty there."""
+    return ScanGrid(*_part(grid, kept))
+
+
+@njit()
+def _scan_grid(points, azimuth, order, bounds):
     count = len(order)
     row, placed = np.empty(count, np.int32), np.empty((count, 3))
     range_m, placed_azimuth = np.empty(count), np.empty(count)
@@ -63,12 +72,11 @@ def scan_grid(points, azimuth, order, bounds):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         row[k], range_m[k], placed_azimuth[k] = i, math.sqrt(x * x + y * y + z * z), azimuth[i]
         placed[k, 0], placed[k, 1], placed[k, 2] = x, y, z
-    return ScanGrid(row, placed, range_m, placed_azimuth, bounds)
+    return row, placed, range_m, placed_azimuth, bounds
 
 
 @njit()
-def part(grid, kept):
-    """The ScanGrid of the `kept` (P,) points alone; rings may be empty there."""
+def _part(grid, kept):
     bounds = np.zeros(len(grid.bounds), np.int64)
     for ring in range(len(bounds) - 1):
         bounds[ring + 1] = bounds[ring] + kept[grid.bounds[ring]: grid.bounds[ring + 1]].sum()
@@ -82,7 +90,7 @@ def part(grid, kept):
             for axis in range(3):
                 points[at, axis] = grid.points[k, axis]
             at += 1
-    return ScanGrid(row, points, range_m, azimuth, bounds)
+    return row, points, range_m, azimuth, bounds
 
 
 @njit(inline="always")

@@ -11,9 +11,13 @@ from lidarflow.kernels.compiled import njit
 Parts = namedtuple("Parts", ("bounds", "rows", "place", "edge_bounds", "edges"))
 
 
-@njit()
-def split(component, edges, wanted):
+def split(component: np.ndarray, edges: np.ndarray, wanted: np.ndarray) -> Parts:
     """Those components of variables (M,) that are `wanted` (C,), in order, with the edges (E, 2) within."""
+    return Parts(*_split(component, edges, wanted))
+
+
+@njit()
+def _split(component, edges, wanted):
     part = np.full(len(wanted), -1, np.int32)
     count = 0
     for c in range(len(wanted)):
@@ -43,4 +47,4 @@ def split(component, edges, wanted):
         if c >= 0:
             between[edges_filled[c], 0], between[edges_filled[c], 1] = edges[e, 0], edges[e, 1]
             edges_filled[c] += 1
-    return Parts(bounds, rows, place, edge_bounds, between)
+    return bounds, rows, place, edge_bounds, between

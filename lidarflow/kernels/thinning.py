@@ -37,7 +37,8 @@ def planes(points: np.ndarray, normal_radius_m: float, min_width_m: float) -> tu
     As normals.estimate, and as normals.level where a neighbourhood is narrower than `min_width_m`.
     """
     _launch_threads()
-    return _planes(np.ascontiguousarray(points), float(normal_radius_m), float(min_width_m))
+    grown, found = _planes(np.ascontiguousarray(points), float(normal_radius_m), float(min_width_m))
+    return Tree(*grown), found
 
 
 def thinned(
@@ -50,9 +51,10 @@ def thinned(
     the median range; normals are fitted within `radius_voxels`, to what is as wide as `width_voxels`.
     """
     _launch_threads()
-    return _thinned(
+    means, grown, found, voxel_m, count = _thinned(
         np.ascontiguousarray(points), float(min_range_m), float(max_range_m), float(voxel_m), scene_share,
         radius_voxels, width_voxels)
+    return means, Tree(*grown), found, voxel_m, count
 
 
 def _launch_threads() -> None:
@@ -66,7 +68,7 @@ def _planes(points, normal_radius_m, min_width_m):
     near = cells.built(grown.points, normal_radius_m)
     found, is_narrow = normals.estimated(grown.points, near, grown.points, near, min_width_m)
     normals.level(found, is_narrow)
-    return grown, found
+    return grown[:], found
 
 
 @njit()

@@ -42,13 +42,18 @@ NOTHING = Tree(
 
 def build(points: np.ndarray) -> Tree:
     """The tree over finite points (N, 3), which may be none."""
-    return grown(np.ascontiguousarray(points, float))
+    return Tree(*_grown(np.ascontiguousarray(points, float)))
 
 
 def moved(tree: Tree, points: np.ndarray) -> Tree:
     """The tree of the same rows once they have moved together to `points` (N, 3); boxes are made anew."""
     placed, boxes = _moved(tree, np.ascontiguousarray(points))
     return tree._replace(points=placed, boxes=boxes)
+
+
+@njit()
+def _grown(points):
+    return grown(points)[:]
 
 
 @njit()

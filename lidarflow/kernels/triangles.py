@@ -27,7 +27,8 @@ class Triangles(NamedTuple):
 def build(corners: np.ndarray) -> Triangles:
     """Triangles, given by their corners (T, 3, 3); there may be none."""
     tree = trees.build((corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3.0)
-    return _arranged(np.ascontiguousarray(corners, float), tree)
+    placed, boxes, around = _arranged(np.ascontiguousarray(corners, float), tree)
+    return Triangles(placed, boxes, tree._replace(boxes=around))
 
 
 def nearest(triangles: Triangles, lone: Tree, points: np.ndarray, reach_m: float) -> np.ndarray:
@@ -60,7 +61,7 @@ def _arranged(corners, tree):
             for i in range(first, end):
                 around[node, 0, k] = min(around[node, 0, k], inside[i, 0, k])
                 around[node, 1, k] = max(around[node, 1, k], inside[i, 1, k])
-    return Triangles(placed, boxes, Tree(tree.points, tree.rows, tree.starts, tree.ends, around))
+    return placed, boxes, around
 
 
 @njit(parallel=True)
