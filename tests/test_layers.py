@@ -9,7 +9,8 @@ from shared_data import ROOT
 PACKAGE = ROOT / "lidarflow"
 LAYERS = [
     {"errors", "__version__"},
-    {"aside", "open3d_import", "pose", "robust", "rows", "colour", "kernels", "interrupts", "silence", "stopwatch"},
+    {"aside", "open3d_import", "pose", "robust", "rows", "colour", "interrupts", "kernels", "silence",
+     "stopwatch"},
     {"checks", "rgbd_colour"},    # they use pose, and colour
     {"types", "rgbd_types"},
     {"config"},
