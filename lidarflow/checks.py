@@ -4,6 +4,7 @@ What programs hand over, such as points, is an InputError, which is a LidarflowE
 """
 
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,13 @@ def as_points(name: str, points: Any) -> np.ndarray:
         if isinstance(found, np.ma.MaskedArray):
             found = np.ma.filled(found.astype(np.float64), np.nan)
         return whole_or_nan(np.ascontiguousarray(found, np.float64))
+
+
+def as_path(name: str, path: Any) -> Path:
+    """A path; InputError, which calls it `name`, for anything but a str or a path."""
+    if not isinstance(path, str | os.PathLike) or isinstance(os.fspath(path), bytes):
+        raise InputError(f"{name}: of type {type(path).__name__}; expected a path, a str or pathlib.Path")
+    return Path(path)
 
 
 def as_time_ns(name: str, time_ns: Any) -> int:

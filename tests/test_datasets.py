@@ -12,9 +12,9 @@ from shared_data import SHARED, needs_shared
 from lidarflow import pose
 from lidarflow.datasets import LOADERS, guess_loader, loader_names, open_dataset
 from lidarflow.datasets.base import times_from_names
-from lidarflow.datasets.clouds import natural_sorted
+from lidarflow.datasets.clouds import natural_sorted, read_scan
 from lidarflow.datasets.kitti_correction import correct_vertical_angle
-from lidarflow.errors import ConfigError, DataError, InstallError
+from lidarflow.errors import ConfigError, DataError, InputError, InstallError
 
 # --- folders ---
 
@@ -488,3 +488,25 @@ def test_every_shared_folder_opens(folder, loader, scans, has_truth, has_poses):
         still = truth.valid & ~truth.is_dynamic & (np.linalg.norm(source.points, axis=1) < 50)
         assert np.median(np.linalg.norm(truth.flow - ego_flow, axis=1)[still]) < 0.01
         assert (truth.object_id[truth.is_dynamic & truth.valid] >= 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("given", [None, b"scan.bin", 3, np.zeros((4, 3))])
+def test_what_is_no_path_is_told_in_one_line(given):
+    for read in (read_scan, open_dataset):
+        found = rf"{read.__name__}: of type {type(given).__name__}; expected a path"
+        with pytest.raises(InputError, match=found):
+            read(given)
+
+
+def test_an_organised_cloud_says_how_to_save_it(tmp_path):
+    np.save(tmp_path / "scan.npy", np.ones((4, 5, 3)))
+    with pytest.raises(DataError, match=r"array\.reshape\(-1, array\.shape\[2\]\)"):
+        read_scan(tmp_path / "scan.npy")
+
+
+def test_the_number_of_a_scan_is_whole(tmp_path):
+    np.save(tmp_path / "scan.npy", np.ones((4, 3)))
+    dataset = open_dataset(tmp_path)
+    assert len(dataset.scan(np.int64(0)).points) == 4
+    with pytest.raises(InputError, match=r"scan 0\.0; expected the number of a scan"):
+        dataset.scan(0.0)

@@ -5,6 +5,7 @@ import importlib
 import pkgutil
 from pathlib import Path
 
+from lidarflow.checks import as_path
 from lidarflow.datasets import argoverse2, clouds, kitti, kitti_tracking, range_images, velodyne
 from lidarflow.datasets.base import Dataset, Source
 from lidarflow.datasets.clouds import read_points, read_scan
@@ -39,7 +40,7 @@ def open_dataset(folder: Path | str, dataloader: str | None = None,
     Raises DataError for a folder that is missing, empty or holds nothing readable, and for an unknown
     loader; InstallError where a loader's package is missing.
     """
-    folder = Path(folder)
+    folder = as_path("open_dataset", folder)
     if not folder.exists():
         raise DataError(f"{folder}: no such folder")
     if folder.suffix.lower() == ".db3" and folder.is_file():

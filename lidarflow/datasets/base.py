@@ -9,9 +9,10 @@ from typing import Protocol
 
 import numpy as np
 
+from lidarflow.checks import is_whole
 from lidarflow.datasets import clouds
 from lidarflow.datasets.kitti_correction import correct_vertical_angle
-from lidarflow.errors import DataError
+from lidarflow.errors import DataError, InputError
 from lidarflow.types import Scan, Truth
 
 _PERIOD_NS = 100_000_000     # of 10 Hz
@@ -123,7 +124,9 @@ def _far_apart(times_ns: Sequence[int]) -> list[str]:
 
 
 def check_index(dataset: Dataset, index: int) -> None:
-    """Raise DataError unless `index` is one of the data set's scans."""
+    """Raise DataError unless `index` is one of the data set's scans, InputError unless it is whole."""
+    if not is_whole(index):
+        raise InputError(f"{dataset.name}: scan {index!r}; expected the number of a scan, from 0 on")
     if not 0 <= index < len(dataset):
         raise DataError(f"{dataset.name}: no scan {index}; there are {len(dataset)}, from 0 on")
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarflow.checks import as_path
 from lidarflow.datasets import arrays, pcd, ply
 from lidarflow.datasets.kitti_correction import correct_vertical_angle, is_wanted
 from lidarflow.errors import DataError
@@ -56,7 +57,7 @@ def read_points(path: Path) -> np.ndarray:
 
 def read_scan(path: Path | str, kitti_correction: str = "auto") -> Scan:
     """One cloud file as a Scan; "auto" corrects .bin files that lie where KITTI puts them."""
-    path = Path(path)
+    path = as_path("read_scan", path)
     points = read_points(path)
     if is_corrected(path, kitti_correction):
         points = correct_vertical_angle(points)
@@ -247,7 +248,9 @@ def _is_cloud(array: np.ndarray) -> bool:
 
 def _columns(path: Path, array: np.ndarray) -> np.ndarray:
     if not _is_cloud(array):
-        raise DataError(f"{path}: an array {array.shape} of {array.dtype}; expected numbers (N, 3) or wider")
+        hint = "; an organised cloud: save array.reshape(-1, array.shape[2])" if array.ndim == 3 else ""
+        raise DataError(
+            f"{path}: an array {array.shape} of {array.dtype}; expected numbers (N, 3) or wider{hint}")
     if len(array) <= _MOST_FIELDS < array.shape[1]:
         raise DataError(f"{path}: an array {array.shape}; expected a row (N, 3) for each point, this looks "
                         "transposed, a column for each")
