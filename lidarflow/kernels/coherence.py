@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from lidarflow.kernels import cells, lanes
+from lidarflow.kernels import cells, lanes, queue
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import solve_positive3
 
@@ -40,10 +40,14 @@ def _local_shifts(points, asked, planes, seen, min_planes, min_rms_m):
     n, cell_count = len(points), len(asked.place)
     shifts, counts = np.zeros((n, 3)), np.zeros(n, np.int64)
     before_m, after_m = np.zeros(n), np.zeros(n)
-    for chunk in numba.prange((cell_count + _CHUNK - 1) // _CHUNK):
-        start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, cell_count)
-        _some_shifts(points, asked, planes, seen, start, end, min_planes, min_rms_m, shifts, counts,
-                     before_m, after_m)
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (cell_count + _CHUNK - 1) // _CHUNK:
+            start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, cell_count)
+            _some_shifts(points, asked, planes, seen, start, end, min_planes, min_rms_m, shifts, counts,
+                         before_m, after_m)
+            chunk = queue.take(waiting)
     return shifts, counts, before_m, after_m
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from lidarflow.kernels import queue
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.sorting import sort
 
@@ -239,16 +240,20 @@ def _around(ground, points, rows, neighbours, reach_m):
 @njit(parallel=True)
 def _is_level(ground, points, rows, neighbours, height_m):
     found, reach_sq = np.empty(len(rows), np.bool_), (_BLOCK * ground.cell_m) ** 2
-    for chunk in numba.prange((len(rows) + _CHUNK - 1) // _CHUNK):
-        near_sq, near_heights = np.empty(neighbours), np.empty(neighbours)
-        for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(rows))):
-            x, y, z = points[rows[k], 0], points[rows[k], 1], points[rows[k], 2]
-            told = _at_a_glance(ground, x, y, z, neighbours, height_m)
-            if told == _UNKNOWN:
-                level = _level(ground, x, y, reach_sq, near_sq, near_heights)
-                found[k] = abs(z - level) <= height_m      # not where the level is NaN
-            else:
-                found[k] = told == _YES
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (len(rows) + _CHUNK - 1) // _CHUNK:
+            near_sq, near_heights = np.empty(neighbours), np.empty(neighbours)
+            for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(rows))):
+                x, y, z = points[rows[k], 0], points[rows[k], 1], points[rows[k], 2]
+                told = _at_a_glance(ground, x, y, z, neighbours, height_m)
+                if told == _UNKNOWN:
+                    level = _level(ground, x, y, reach_sq, near_sq, near_heights)
+                    found[k] = abs(z - level) <= height_m      # not where the level is NaN
+                else:
+                    found[k] = told == _YES
+            chunk = queue.take(waiting)
     return found
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from lidarflow.kernels import grid
+from lidarflow.kernels import grid, queue
 from lidarflow.kernels.compiled import njit
 
 _PLACES = 4     # of queries that are looked at together, along each side of a gate
@@ -64,19 +64,23 @@ def _best_in_gate(queries, by_place, candidates, keys, lower, shape, gate_m, riv
     n, centres = len(queries.points), queries.points
     best = np.full(n, -1, np.int64)
     best_sq, rival_sq = np.full(n, np.inf), np.full(n, np.inf)
-    for couple in numba.prange((n + 1) // 2):
-        a, b = by_place[2 * couple], by_place[min(2 * couple + 1, n - 1)]
-        near, inside = _near_either(centres[a], centres[b], candidates.points, keys, lower, shape, gate_m)
-        products = np.empty((2, len(near)), np.float32)
-        for k in range(0, len(near), 2):
-            last = min(k + 1, len(near) - 1)
-            products[0, k], products[0, last], products[1, k], products[1, last] = _products(
-                queries.table[queries.row[a]], queries.table[queries.row[b]],
-                candidates.table[candidates.row[near[k]]], candidates.table[candidates.row[near[last]]])
-        for slot in range(2):
-            i = b if slot else a
-            best[i], best_sq[i], rival_sq[i] = _best_and_rival(
-                candidates.points, near, inside[slot], products[slot], rival_radius_m)
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        couple = queue.take(waiting)
+        while couple < (n + 1) // 2:
+            a, b = by_place[2 * couple], by_place[min(2 * couple + 1, n - 1)]
+            near, inside = _near_either(centres[a], centres[b], candidates.points, keys, lower, shape, gate_m)
+            products = np.empty((2, len(near)), np.float32)
+            for k in range(0, len(near), 2):
+                last = min(k + 1, len(near) - 1)
+                products[0, k], products[0, last], products[1, k], products[1, last] = _products(
+                    queries.table[queries.row[a]], queries.table[queries.row[b]],
+                    candidates.table[candidates.row[near[k]]], candidates.table[candidates.row[near[last]]])
+            for slot in range(2):
+                i = b if slot else a
+                best[i], best_sq[i], rival_sq[i] = _best_and_rival(
+                    candidates.points, near, inside[slot], products[slot], rival_radius_m)
+            couple = queue.take(waiting)
     return best, best_sq, rival_sq
 
 

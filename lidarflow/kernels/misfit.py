@@ -34,10 +34,15 @@ def counterparts(
 @njit(parallel=True)
 def _counterparts_in_chunks(points, normals, target, target_normals, reach_m, min_agreement, row, distance_m,
                             agrees, offset_m):
-    for chunk in numba.prange((len(points) + trees.CHUNK - 1) // trees.CHUNK):
-        start, end = chunk * trees.CHUNK, (chunk + 1) * trees.CHUNK
-        _counterparts(points[start:end], normals[start:end], target, target_normals, reach_m, min_agreement,
-                      row[start:end], distance_m[start:end], agrees[start:end], offset_m[start:end])
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (len(points) + trees.CHUNK - 1) // trees.CHUNK:
+            start, end = chunk * trees.CHUNK, (chunk + 1) * trees.CHUNK
+            _counterparts(
+                points[start:end], normals[start:end], target, target_normals, reach_m, min_agreement,
+                row[start:end], distance_m[start:end], agrees[start:end], offset_m[start:end])
+            chunk = queue.take(waiting)
 
 
 @njit()

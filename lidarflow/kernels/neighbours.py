@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from lidarflow.kernels import stack
+from lidarflow.kernels import queue, stack
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.tree import (
     CHUNK,
@@ -70,9 +70,13 @@ def any_within(tree: Tree, points: np.ndarray, reach_m: np.ndarray) -> np.ndarra
 
 @njit(parallel=True)
 def _query_in_chunks(tree, points, reach_m, distance_m, row):
-    for chunk in numba.prange((len(points) + CHUNK - 1) // CHUNK):
-        start, end = chunk * CHUNK, (chunk + 1) * CHUNK
-        _query(tree, points[start:end], reach_m, distance_m[start:end], row[start:end])
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (len(points) + CHUNK - 1) // CHUNK:
+            start, end = chunk * CHUNK, (chunk + 1) * CHUNK
+            _query(tree, points[start:end], reach_m, distance_m[start:end], row[start:end])
+            chunk = queue.take(waiting)
 
 
 @njit()
@@ -169,9 +173,13 @@ def _before(tree, marks):
 
 @njit(parallel=True)
 def _counts_in_chunks(tree, before, points, radius_m, counts):
-    for chunk in numba.prange((len(points) + CHUNK - 1) // CHUNK):
-        start, end = chunk * CHUNK, (chunk + 1) * CHUNK
-        _counts_around(tree, before, points[start:end], radius_m, counts[start:end])
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (len(points) + CHUNK - 1) // CHUNK:
+            start, end = chunk * CHUNK, (chunk + 1) * CHUNK
+            _counts_around(tree, before, points[start:end], radius_m, counts[start:end])
+            chunk = queue.take(waiting)
 
 
 @njit()

@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from lidarflow.kernels import cells, lanes
+from lidarflow.kernels import cells, lanes, queue
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.linalg import plane_eigen3
 
@@ -35,10 +35,14 @@ def estimated(points, asked, surface, seen, min_width_m):
     """
     normals, is_narrow = np.full((len(points), 3), np.nan), np.zeros(len(points), np.bool_)
     count = len(asked.place)
-    for chunk in numba.prange((count + _CHUNK - 1) // _CHUNK):
-        _estimate_some(
-            points, asked, surface, seen, chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), min_width_m,
-            normals, is_narrow)
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (count + _CHUNK - 1) // _CHUNK:
+            _estimate_some(
+                points, asked, surface, seen, chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), min_width_m,
+                normals, is_narrow)
+            chunk = queue.take(waiting)
     return normals, is_narrow
 
 

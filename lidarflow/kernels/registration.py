@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from lidarflow.kernels import lanes
+from lidarflow.kernels import lanes, queue
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.icp import Nearest, follow
 from lidarflow.kernels.linalg import moved
@@ -36,11 +36,16 @@ _LOWER = np.tril_indices(6)
 def _sums(points, motion, target, target_normals, reach_m, nearest):
     chunks = (len(points) + _CHUNK - 1) // _CHUNK
     parts = np.zeros((chunks, _SUMS))
-    for chunk in numba.prange(chunks):
-        start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
-        block = np.zeros(_ROWS * lanes.padded(end - start))     # columns that stay empty weigh nothing
-        parts[chunk, -1] = _meet(points, start, end, motion, target, target_normals, reach_m, nearest, block)
-        _add_up(block, parts[chunk])
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < chunks:
+            start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
+            block = np.zeros(_ROWS * lanes.padded(end - start))     # columns that stay empty weigh nothing
+            parts[chunk, -1] = _meet(
+                points, start, end, motion, target, target_normals, reach_m, nearest, block)
+            _add_up(block, parts[chunk])
+            chunk = queue.take(waiting)
     total = np.zeros(_SUMS)
     for chunk in range(chunks):
         total += parts[chunk]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from lidarflow.kernels import grid, local_frame
+from lidarflow.kernels import grid, local_frame, queue
 from lidarflow.kernels.compiled import njit
 
 SIZE = 352
@@ -21,7 +21,7 @@ _BINS = 11
 _VOLUMES = 32
 _SECTORS = 8
 _SHARES = 5      # bins that a neighbour is shared among: its own and one beside it in each direction
-_CHUNK = 64      # keypoints that one thread takes at a time
+_CHUNK = 16      # keypoints that one thread takes at a time
 _TINY = 1e-300
 
 
@@ -63,10 +63,15 @@ def describe_into(
 
 @njit(parallel=True)
 def _describe(keypoints, surface, normals, keys, lower, shape, radius_m, min_neighbours, table, rows, frames):
-    for chunk in numba.prange((len(keypoints) + _CHUNK - 1) // _CHUNK):
-        start, end = chunk * _CHUNK, (chunk + 1) * _CHUNK
-        _describe_some(keypoints[start:end], surface, normals, keys, lower, shape, radius_m, min_neighbours,
-                       table, rows[start:end], frames[start:end])
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (len(keypoints) + _CHUNK - 1) // _CHUNK:
+            start, end = chunk * _CHUNK, (chunk + 1) * _CHUNK
+            _describe_some(
+                keypoints[start:end], surface, normals, keys, lower, shape, radius_m, min_neighbours, table,
+                rows[start:end], frames[start:end])
+            chunk = queue.take(waiting)
 
 
 @njit()

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from lidarflow.kernels import stack
+from lidarflow.kernels import queue, stack
 from lidarflow.kernels import tree as trees
 from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.tree import Tree
@@ -66,9 +66,13 @@ def _arranged(corners, tree):
 
 @njit(parallel=True)
 def _nearest_in_chunks(corners, boxes, tree, lone, points, reach_m, places):
-    for chunk in numba.prange((len(points) + trees.CHUNK - 1) // trees.CHUNK):
-        start, end = chunk * trees.CHUNK, (chunk + 1) * trees.CHUNK
-        _nearest(corners, boxes, tree, lone, points[start:end], reach_m, places[start:end])
+    waiting = np.zeros(1, np.int64)
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (len(points) + trees.CHUNK - 1) // trees.CHUNK:
+            start, end = chunk * trees.CHUNK, (chunk + 1) * trees.CHUNK
+            _nearest(corners, boxes, tree, lone, points[start:end], reach_m, places[start:end])
+            chunk = queue.take(waiting)
 
 
 @njit(error_model="numpy")
