@@ -54,3 +54,13 @@ def test_scans_with_nothing_in_common_are_still_refused():
     below, above = (ego.Thinned.of(floor + (0.0, 0.0, height_m), CONFIG) for height_m in (-2.0, 20.0))
     with pytest.raises(DataError, match="are these consecutive scans"):
         ego.find(below, above, None, CONFIG.ego)
+
+
+def test_sparse_scans_are_not_searched_from_all_around(monkeypatch):
+    """A tenth of the points: few meet within the last reach, but nearly all come near."""
+    scans, motions = sequence(0, 0.1)
+    source, target = (
+        ego.Thinned.of(scan.points[np.random.default_rng(seed).random(len(scan.points)) < 0.1], CONFIG)
+        for seed, scan in enumerate(scans))
+    monkeypatch.setattr(ego.wide_search, "best_start", lambda *_: pytest.fail("searched from all around"))
+    assert pose.translation_distance(ego.find(source, target, None, CONFIG.ego), motions[0]) < 0.05

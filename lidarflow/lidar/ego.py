@@ -27,6 +27,7 @@ _SURPRISE_M = 0.3            # a guess farther off than this, or turned more, is
 _SURPRISE_RAD = 0.03
 _SAME_M = 0.02               # registrations that end nearer to one another agree
 _SAME_RAD = 0.002
+_ABOUT_RIGHT = 0.9           # of the source within a coarse voxel: 0.94 or more at 10 Hz, at most 0.76 if off
 _SURELY_MEETS = 0.2          # within the last reach: scans of two places were brought together by up to 0.17
 _CLEARLY_MORE = 0.04         # of the source within the fourth reach: 0.06 to 0.22 when rest led nowhere
 _USUAL_OVERLAP = 0.5         # within the last reach: 0.6 to 0.9 of dense scans that lie right, less if not
@@ -74,7 +75,7 @@ def find(source: Thinned, target: Thinned, guess: np.ndarray | None, config: Ego
     from_rest = _found(source, target, lambda: register(source, target))
     is_settled = best is not None and _agree(best, from_rest)
     best = from_rest if best is None else best.or_better(from_rest)
-    if best.share < _USUAL_OVERLAP and not is_settled:
+    if best.share < _USUAL_OVERLAP and not is_settled and not _is_about_right(source, target, best):
         best = _or_all_around(source, target, best)
     if best.refusal:
         raise best.refusal
@@ -112,6 +113,12 @@ def _agree(one: _Found, other: _Found) -> bool:
         not one.refusal and not other.refusal
         and pose.translation_distance(one.motion, other.motion) < _SAME_M
         and pose.rotation_distance(one.motion, other.motion) < _SAME_RAD)
+
+
+def _is_about_right(source: Thinned, target: Thinned, found: _Found) -> bool:
+    """Whether nearly all of the source comes near to the target: sparse scans need not meet more closely."""
+    return found.refusal is None and _overlap(
+        source, target, found.motion, _COARSE_VOXELS) >= _ABOUT_RIGHT
 
 
 def _or_all_around(source: Thinned, target: Thinned, best: _Found) -> _Found:
