@@ -19,7 +19,7 @@ from lidarflow import methods, metrics, runner, synthetic
 from lidarflow.baselines import icp
 from lidarflow.config import Config, EgoConfig
 from lidarflow.datasets import open_dataset
-from lidarflow.lidar import ego, registration
+from lidarflow.lidar import ego, odometry, registration
 from lidarflow.types import Scan, ScanPair, Truth
 
 KISS_ALONE = replace(Config(), ego=EgoConfig(method="kiss_icp", refine=False))
@@ -53,7 +53,7 @@ def point_to_point(source, target, start, start_off_m):
 
 def kiss_voxel(voxel_m: float):
     """KISS-ICP with another voxel; its own is a hundredth of the longest range, 0.8 m."""
-    kiss_icp = ego._kiss_icp
+    kiss_icp = odometry._kiss_icp
 
     def made(limits):
         from kiss_icp.kiss_icp import KissICP
@@ -62,7 +62,7 @@ def kiss_voxel(voxel_m: float):
         config.mapping.voxel_size = voxel_m
         return KissICP(config)
 
-    return mock.patch.object(ego, "_kiss_icp", made)
+    return mock.patch.object(odometry, "_kiss_icp", made)
 
 
 def variants():
