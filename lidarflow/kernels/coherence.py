@@ -40,7 +40,7 @@ def _local_shifts(points, asked, planes, seen, min_planes, min_rms_m):
     n, cell_count = len(points), len(asked.place)
     shifts, counts = np.zeros((n, 3)), np.zeros(n, np.int64)
     before_m, after_m = np.zeros(n), np.zeros(n)
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         chunk = queue.take(waiting)
         while chunk < (cell_count + _CHUNK - 1) // _CHUNK:

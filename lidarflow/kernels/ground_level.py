@@ -240,7 +240,7 @@ def _around(ground, points, rows, neighbours, reach_m):
 @njit(parallel=True)
 def _is_level(ground, points, rows, neighbours, height_m):
     found, reach_sq = np.empty(len(rows), np.bool_), (_BLOCK * ground.cell_m) ** 2
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         chunk = queue.take(waiting)
         while chunk < (len(rows) + _CHUNK - 1) // _CHUNK:

@@ -64,7 +64,7 @@ def _best_in_gate(queries, by_place, candidates, keys, lower, shape, gate_m, riv
     n, centres = len(queries.points), queries.points
     best = np.full(n, -1, np.int64)
     best_sq, rival_sq = np.full(n, np.inf), np.full(n, np.inf)
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         couple = queue.take(waiting)
         while couple < (n + 1) // 2:

@@ -34,7 +34,7 @@ def counterparts(
 @njit(parallel=True)
 def _counterparts_in_chunks(points, normals, target, target_normals, reach_m, min_agreement, row, distance_m,
                             agrees, offset_m):
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         chunk = queue.take(waiting)
         while chunk < (len(points) + trees.CHUNK - 1) // trees.CHUNK:

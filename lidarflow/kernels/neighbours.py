@@ -70,7 +70,7 @@ def any_within(tree: Tree, points: np.ndarray, reach_m: np.ndarray) -> np.ndarra
 
 @njit(parallel=True)
 def _query_in_chunks(tree, points, reach_m, distance_m, row):
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         chunk = queue.take(waiting)
         while chunk < (len(points) + CHUNK - 1) // CHUNK:
@@ -173,7 +173,7 @@ def _before(tree, marks):
 
 @njit(parallel=True)
 def _counts_in_chunks(tree, before, points, radius_m, counts):
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         chunk = queue.take(waiting)
         while chunk < (len(points) + CHUNK - 1) // CHUNK:

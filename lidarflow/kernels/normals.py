@@ -35,7 +35,7 @@ def estimated(points, asked, surface, seen, min_width_m):
     """
     normals, is_narrow = np.full((len(points), 3), np.nan), np.zeros(len(points), np.bool_)
     count = len(asked.place)
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         chunk = queue.take(waiting)
         while chunk < (count + _CHUNK - 1) // _CHUNK:

@@ -3,13 +3,14 @@
 import numpy as np
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic, overload, register_jitable
 
 # Kernels loop over places, as numba cannot cache one that asks for the number of threads. Each thread has
 # some of them, and takes tasks at the first until none is left.
 PLACES = 256
 
 
+@register_jitable
 def tasks() -> np.ndarray:
     """A queue from which nothing has been taken: the number of the next task."""
     return np.zeros(1, np.int64)

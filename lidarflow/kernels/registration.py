@@ -36,7 +36,7 @@ _LOWER = np.tril_indices(6)
 def _sums(points, motion, target, target_normals, reach_m, nearest):
     chunks = (len(points) + _CHUNK - 1) // _CHUNK
     parts = np.zeros((chunks, _SUMS))
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         chunk = queue.take(waiting)
         while chunk < chunks:

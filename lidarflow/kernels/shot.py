@@ -63,7 +63,7 @@ def describe_into(
 
 @njit(parallel=True)
 def _describe(keypoints, surface, normals, keys, lower, shape, radius_m, min_neighbours, table, rows, frames):
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         chunk = queue.take(waiting)
         while chunk < (len(keypoints) + _CHUNK - 1) // _CHUNK:

@@ -66,7 +66,7 @@ def _arranged(corners, tree):
 
 @njit(parallel=True)
 def _nearest_in_chunks(corners, boxes, tree, lone, points, reach_m, places):
-    waiting = np.zeros(1, np.int64)
+    waiting = queue.tasks()
     for _ in numba.prange(queue.PLACES):
         chunk = queue.take(waiting)
         while chunk < (len(points) + trees.CHUNK - 1) // trees.CHUNK:
