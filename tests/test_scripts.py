@@ -78,6 +78,15 @@ def test_ego_guesses(street):
     assert from_kiss_icp[1] == "registered from KISS-ICP" and float(from_kiss_icp[4]) < 2e-3
 
 
+def test_where_time_goes(street):
+    found = printed("where_time_goes", street, "--pairs", 1, "--top", 3)
+    names = re.findall(r"^\| (.+?) \| \d+ \|$", found, re.MULTILINE)
+    spent_ms = {name: float(row(found, name)[0]) for name in names}
+    whole_ms = spent_ms.pop("whole pair")
+    assert len(spent_ms) == 6 and spent_ms["Patchwork++"] > 0.0
+    assert abs(sum(spent_ms.values()) - whole_ms) <= 0.5 * (len(spent_ms) + 1)     # each is rounded
+
+
 def test_soak(street):
     found = printed("soak", street, "--rounds", 2, "--scans", 3)
     assert "results: equal" in found and "growth after round 2: none" in found
