@@ -110,6 +110,29 @@ def test_flat_ground_is_found_from_any_height(height_m, is_origin_on_ground):
     assert found[is_thing].mean() < 0.01
 
 
+@pytest.mark.parametrize("aside_m", [1.8, 2.2, 3.5])
+def test_a_car_beside_the_sensor_is_no_ground(aside_m):
+    """Its bonnet and roof are flat, and no road is seen around them: 13,000 of its 17,000 points were."""
+    floor, wall = shapes.box((120.0, 120.0, 0.1), (0.0, 0.0, -0.05)), shapes.box((60, 0.3, 4), (0, 9, 2))
+    body = shapes.box((4.4, 1.8, 0.75), (0.5, aside_m, 0.6))
+    cabin = shapes.box((2.4, 1.6, 0.5), (0.2, aside_m, 1.2))
+    parts = tuple(Part(mesh, "thing") for mesh in (floor, wall, body, cabin))
+    scene = Scene(parts, synthetic.scene.at_rest)
+    sensor = synthetic.hdl64e(columns=1000)
+    points = synthetic.scan_sequence(scene, sensor, 1, rng(5))[0][0].points
+    found = ground.detect(points, np.ones(len(points), bool), CONFIG).mask
+    height_over_ground = points[:, 2] + sensor.height_m
+    on_car = (np.abs(points[:, :2] - [0.5, aside_m]) < [2.3, 1.0]).all(axis=1) & (height_over_ground > 0.4)
+    assert on_car.sum() > 5000 and not found[on_car].any()
+    assert found[height_over_ground < 0.06].mean() > 0.95
+
+
+def test_ground_may_rise_away_from_the_sensor():
+    x, y = rng(6).uniform(-40, 40, (2, 60_000))
+    road = np.column_stack([x, y, np.maximum(0.12 * (x - 5.0), 0.0) - 1.73 + rng(7).normal(0, 0.01, len(x))])
+    assert ground.detect(road, np.ones(len(road), bool), CONFIG).mask.mean() > 0.95
+
+
 def test_a_given_height_is_used_instead_of_the_estimate():
     points = yard(1.73)
     kept = np.ones(len(points), bool)

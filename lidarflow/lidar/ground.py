@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidarflow import robust
 from lidarflow.config import GroundConfig
 from lidarflow.kernels import ground_level
 from lidarflow.rows import median
@@ -20,6 +21,11 @@ _LOW_SHARE = 0.1
 _REFLECTION_DEPTH_M = 0.5
 _FILL_NEIGHBOURS = 8
 _FILL_RADIUS_M = 2.0
+_PLANE_RADIUS_M = 15.0   # so far around the sensor ground is about a plane,
+_PLANE_SCALE_M = 0.15    # to about so much,
+_PLANE_POINTS = 1000     # which as many points tell as well as all
+_PLANE_ROUNDS = 8
+_BEND_RADIUS_M = 50.0    # of a road that rises from it: no street bends more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +58,7 @@ def detect(points: np.ndarray, kept: np.ndarray, config: GroundConfig) -> Ground
     if len(found) == 0:
         return Ground.none(len(points))
     found = found[_close_to_local_ground(points, found, config.max_height_m)]
+    found = found[_led_to(points.take(found, axis=0), config.max_height_m)]
     ground = Ground.none(len(points))
     ground.mask[found] = True
     around = ground_level.flat(points, found, _FILL_RADIUS_M)
@@ -85,6 +92,31 @@ def _close_to_local_ground(points: np.ndarray, rows: np.ndarray, max_height_m: f
     """
     slope_allowance_m = 0.1 * _CELL_M
     return ground_level.is_low(points, rows, _CELL_M, _LOW_SHARE, max_height_m + slope_allowance_m)
+
+
+def _led_to(points: np.ndarray, max_height_m: float) -> np.ndarray:
+    """Mask (K,) of the points (K, 3) that the ground under the sensor leads to.
+
+    The bonnet of a car beside the sensor lies as flat as a road, and hides the road around it. But nothing
+    leads up there: ground lies at most `max_height_m` over the plane around the sensor, and bends upwards.
+    """
+    x, y, z = points.T
+    range_sq = x * x + y * y
+    near = np.flatnonzero(range_sq < _PLANE_RADIUS_M**2)
+    if len(near) < _MIN_CLOUD_POINTS:
+        return np.ones(len(points), bool)
+    by_x, by_y, level_m = _plane(points[near[::max(len(near) // _PLANE_POINTS, 1)]])
+    return z - (by_x * x + by_y * y + level_m) <= max_height_m + range_sq / (2.0 * _BEND_RADIUS_M)
+
+
+def _plane(points: np.ndarray) -> np.ndarray:
+    """Rise per metre along x and y, and height at the origin, of the plane that most points (N, 3) lie on."""
+    rows, weight = np.column_stack([points[:, :2], np.ones(len(points))]), np.ones(len(points))
+    for _ in range(_PLANE_ROUNDS):
+        held = rows * weight[:, None]
+        plane = np.linalg.lstsq(held.T @ rows, held.T @ points[:, 2])[0]
+        _, weight = robust.geman_mcclure((points[:, 2] - rows @ plane) ** 2, _PLANE_SCALE_M)
+    return plane
 
 
 def _patchwork(points: np.ndarray) -> np.ndarray:
