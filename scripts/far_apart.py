@@ -6,34 +6,26 @@ The sensor drives along a street at 8 m/s; turns are about the vertical, between
 pairs that are wrong by more than 0.05 m or 0.01 rad: from rest alone, and with the search from all around.
 """
 
-import argparse
 import time
 from collections.abc import Iterator
 
 import numpy as np
+from generated_pairs import CONFIG, Pair, along, options
 
 from lidarflow import pose, synthetic
-from lidarflow.config import Config
 from lidarflow.errors import DataError
 from lidarflow.lidar import ego
 
 GAPS_S = (0.1, 0.5, 1.0, 1.5)
 TURNS_RAD = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
 OFF_M, OFF_RAD = 0.05, 0.01
-CONFIG = Config()
-
-Pair = tuple[ego.Thinned, ego.Thinned, np.ndarray]
 
 
 def apart(gap_s: float, seeds: int, pairs: int) -> Iterator[Pair]:
-    """Scans so long apart, thinned, and the motion between them."""
+    """Scans so long apart, and the motion between them."""
     for seed in range(seeds):
-        scans = synthetic.scan_sequence(
-            synthetic.street(np.random.default_rng(seed)), synthetic.hdl64e(columns=500), pairs + 1,
-            np.random.default_rng(1), gap_s)
-        thinned = [ego.Thinned.of_scan(scan, CONFIG) for scan, _ in scans]
-        for source, target, (_, truth) in zip(thinned, thinned[1:], scans, strict=False):
-            yield source, target, truth.ego_motion
+        street = synthetic.street(np.random.default_rng(seed))
+        yield from along(street, synthetic.hdl64e(columns=500), pairs, 1, gap_s)
 
 
 def turned(turn_rad: float, seeds: int, pairs: int) -> Iterator[Pair]:
@@ -65,16 +57,13 @@ def row(pairs: list[Pair]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=8)
-    parser.add_argument("--pairs", type=int, default=2)
-    options = parser.parse_args()
+    wanted = options(__doc__, pairs=2)
     print("| between scans | pairs | off, from rest | off, as found | longest s |")
     print("|---|---|---|---|---|")
     for gap_s in GAPS_S:
-        print(f"| {8.0 * gap_s:.1f} m | {row(list(apart(gap_s, options.seeds, options.pairs)))}")
+        print(f"| {8.0 * gap_s:.1f} m | {row(list(apart(gap_s, wanted.seeds, wanted.pairs)))}")
     for turn_rad in TURNS_RAD:
-        print(f"| {np.rad2deg(turn_rad):.0f}° | {row(list(turned(turn_rad, options.seeds, options.pairs)))}")
+        print(f"| {np.rad2deg(turn_rad):.0f}° | {row(list(turned(turn_rad, wanted.seeds, wanted.pairs)))}")
 
 
 if __name__ == "__main__":
