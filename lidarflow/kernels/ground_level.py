@@ -229,11 +229,15 @@ def _range_around(lowest, highest, x, y, width):
 @njit(parallel=True)
 def _around(ground, points, rows, neighbours, reach_m):
     levels = np.empty(len(rows))
-    for chunk in numba.prange((len(rows) + _CHUNK - 1) // _CHUNK):
-        near_sq, near_heights = np.empty(neighbours), np.empty(neighbours)
-        for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(rows))):
-            x, y = points[rows[k], 0], points[rows[k], 1]
-            levels[k] = _level(ground, x, y, reach_m * reach_m, near_sq, near_heights)
+    waiting = queue.tasks()
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (len(rows) + _CHUNK - 1) // _CHUNK:
+            near_sq, near_heights = np.empty(neighbours), np.empty(neighbours)
+            for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(rows))):
+                x, y = points[rows[k], 0], points[rows[k], 1]
+                levels[k] = _level(ground, x, y, reach_m * reach_m, near_sq, near_heights)
+            chunk = queue.take(waiting)
     return levels
 
 

@@ -7,6 +7,7 @@ nothing.
 import numba
 import numpy as np
 
+from lidarflow.kernels import queue
 from lidarflow.kernels.compiled import njit
 
 _CHUNK = 1024
@@ -16,9 +17,13 @@ _CHUNK = 1024
 def nearest(points, centres):
     """Index (N,) int32 of the centre (K, 3) nearest to each point (N, 3); −1 where z is 0. All float32."""
     label = np.empty(len(points), np.int32)
-    for chunk in numba.prange((len(points) + _CHUNK - 1) // _CHUNK):
-        start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
-        _label_chunk(points[start:end], centres, label[start:end])
+    waiting = queue.tasks()
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < (len(points) + _CHUNK - 1) // _CHUNK:
+            start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
+            _label_chunk(points[start:end], centres, label[start:end])
+            chunk = queue.take(waiting)
     return label
 
 
@@ -48,16 +53,20 @@ def _sums(points, centres):
     """Sums (K, 4) of the coordinates of the points nearest to each centre, and their number."""
     chunks = (len(points) + _CHUNK - 1) // _CHUNK
     partial = np.zeros((chunks, len(centres), 4))
-    for chunk in numba.prange(chunks):
-        start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
-        label = np.empty(end - start, np.int32)
-        _label_chunk(points[start:end], centres, label)
-        for i in range(end - start):
-            k = label[i]
-            if k >= 0:
-                for axis in range(3):
-                    partial[chunk, k, axis] += points[start + i, axis]
-                partial[chunk, k, 3] += 1.0
+    waiting = queue.tasks()
+    for _ in numba.prange(queue.PLACES):
+        chunk = queue.take(waiting)
+        while chunk < chunks:
+            start, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(points))
+            label = np.empty(end - start, np.int32)
+            _label_chunk(points[start:end], centres, label)
+            for i in range(end - start):
+                k = label[i]
+                if k >= 0:
+                    for axis in range(3):
+                        partial[chunk, k, axis] += points[start + i, axis]
+                    partial[chunk, k, 3] += 1.0
+            chunk = queue.take(waiting)
     total = np.zeros((len(centres), 4))
     for chunk in range(chunks):
         total += partial[chunk]

@@ -4,6 +4,7 @@ import math
 
 import numba
 import numpy as np
+from numba.extending import register_jitable
 
 from lidarflow.kernels import cells, grid, normals
 from lidarflow.kernels import tree as trees
@@ -11,6 +12,12 @@ from lidarflow.kernels.compiled import njit
 from lidarflow.kernels.tree import Tree
 
 _LEAST_RADIUS_M = 1e-6    # of a place that is one point
+
+
+@register_jitable
+def voxel_for(wanted_m: float, scene_share: float, median_m: float) -> float:
+    """The wanted voxel, or a smaller one in a small place: `scene_share` of the median range; metres."""
+    return min(wanted_m, scene_share * median_m)
 
 
 @njit()
@@ -74,7 +81,7 @@ def _planes(points, normal_radius_m, min_width_m):
 @njit()
 def _thinned(points, min_range_m, max_range_m, voxel_m, scene_share, radius_voxels, width_voxels):
     kept, median_m = in_range(points, min_range_m, max_range_m)
-    voxel_m = min(voxel_m, scene_share * median_m)
+    voxel_m = voxel_for(voxel_m, scene_share, median_m)
     means = grid.averaged(kept, voxel_m) if voxel_m > 0.0 else kept
     grown, found = _planes(means, max(radius_voxels * voxel_m, _LEAST_RADIUS_M), width_voxels * voxel_m)
     return means, grown, found, voxel_m, len(kept)

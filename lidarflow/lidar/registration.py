@@ -35,7 +35,7 @@ def voxel_for(points: np.ndarray, wanted_m: float) -> float:
     """Voxel in metres to thin points (N, 3) to: the wanted one, or a smaller one in a small place."""
     range_sq = np.einsum("ij,ij->i", points, points)
     scene_m = float(np.sqrt(np.median(range_sq))) if len(points) else 0.0
-    return min(wanted_m, _SCENE_VOXEL_SHARE * scene_m)
+    return thinning.voxel_for(wanted_m, _SCENE_VOXEL_SHARE, scene_m)
 
 
 def thinned(points: np.ndarray, voxel_m: float, name: str = "") -> np.ndarray:
