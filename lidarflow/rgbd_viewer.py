@@ -14,6 +14,7 @@ import rerun.blueprint as rrb
 from lidarflow import colour, pose, rgbd_colour, rgbd_io, viewer
 from lidarflow.rgbd_metrics import WarpScores
 from lidarflow.rgbd_types import RgbdPair, RgbdResult
+from lidarflow.rows import sparse
 
 WORLD, CAMERA, TRAJECTORY = "world", "world/camera", "world/trajectory"
 POINTS, ARROWS = f"{CAMERA}/points", f"{CAMERA}/own_motion_x5"
@@ -72,7 +73,7 @@ def log_result(stream: rr.RecordingStream, color: np.ndarray, result: RgbdResult
     _log_camera(stream, color, result, world_from_source)
     stream.log(POINTS, rr.Points3D(result.points[valid], colors=moving[valid],
                                    radii=rr.Radius.ui_points(_POINT_PX)))
-    shown = viewer.thinned((valid & result.is_dynamic).ravel(), MAX_ARROWS)
+    shown = sparse(np.flatnonzero(valid & result.is_dynamic), MAX_ARROWS)
     stream.log(ARROWS, rr.Arrows3D(
         origins=result.points.reshape(-1, 3)[shown], vectors=_ARROW_SCALE * own_motion.reshape(-1, 3)[shown],
         colors=[colour.ARROW], radii=rr.Radius.ui_points(_ARROW_PX)))

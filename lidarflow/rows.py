@@ -30,6 +30,29 @@ def whole_or_nan(vectors: np.ndarray) -> np.ndarray:
     return vectors
 
 
+def spread(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` of the rows (N, …), evenly over their order."""
+    if len(rows) <= most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, most).astype(int)]
+
+
+def sparse(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` of the rows (N, …), in steps of one size.
+
+    They may be half as many: of pixels or arrows side by side, uneven steps would show as a pattern.
+    """
+    return rows[:: max(-(-len(rows) // most), 1)]
+
+
+def every_few(count: int, least: int) -> slice:
+    """Which of `count` rows to take so that at least `least`, and fewer than twice as many, are left, if any.
+
+    In steps of one size, as a slice: what is found of these rows can be written back among all.
+    """
+    return slice(None, None, max(count // least, 1))
+
+
 def mean(vectors: np.ndarray) -> np.ndarray:
     """The mean (3,) of vectors (N, 3), at least one."""
     return np.einsum("ij->j", vectors) / len(vectors)

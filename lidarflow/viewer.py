@@ -22,6 +22,7 @@ import rerun.blueprint as rrb
 from lidarflow import colour, pose
 from lidarflow.errors import DataError, InstallError
 from lidarflow.rgbd_types import RgbdPair
+from lidarflow.rows import sparse
 from lidarflow.silence import silenced
 from lidarflow.types import FlowResult, ScanPair
 
@@ -257,7 +258,7 @@ def _log_motion(stream: rr.RecordingStream, points: np.ndarray, flow: np.ndarray
     colours = colour.motion_colours(residual_flow, moving, dt_s)
     _log_points(stream, STATIC, points[static], colour.static_shade(points[static]), _STATIC_PX)
     _log_points(stream, MOVING, points[moving], colours[moving], _MOVING_PX)
-    shown = thinned(moving, MAX_RESIDUAL_ARROWS)
+    shown = sparse(np.flatnonzero(moving), MAX_RESIDUAL_ARROWS)
     _log_arrows(stream, RESIDUAL_ARROWS, points[shown], residual_flow[shown], colours[shown], 0.7)
 
 
@@ -309,7 +310,7 @@ def _log_matches(stream: rr.RecordingStream, result: FlowResult) -> None:
 
 
 def _log_total_arrows(stream: rr.RecordingStream, points: np.ndarray, flow: np.ndarray) -> None:
-    shown = thinned(np.isfinite(points + flow).all(axis=1), MAX_TOTAL_ARROWS)
+    shown = sparse(np.flatnonzero(np.isfinite(points + flow).all(axis=1)), MAX_TOTAL_ARROWS)
     _log_arrows(stream, TOTAL_ARROWS, points[shown], flow[shown], [(110, 110, 130)], 0.4)
 
 
@@ -322,12 +323,6 @@ def _log_arrows(stream: rr.RecordingStream, entity: str, origins: np.ndarray, ve
                 size_px: float) -> None:
     stream.log(entity, rr.Arrows3D(origins=origins.astype(np.float32), vectors=vectors.astype(np.float32),
                                    colors=colours, radii=rr.Radius.ui_points(size_px)))
-
-
-def thinned(mask: np.ndarray, limit: int) -> np.ndarray:
-    """Indices of the rows in `mask`, evenly thinned to at most `limit`."""
-    rows = np.flatnonzero(mask)
-    return rows[:: max(1, -(-len(rows) // limit))]
 
 
 def require_live_view() -> None:

@@ -49,3 +49,16 @@ def test_numbers_lose_their_gaps_and_keep_their_order():
     found = rows.without_gaps(numbers)
     assert found.tolist() == [2, 1, 1, 3, 0] and found.dtype == np.int32
     assert rows.without_gaps(np.empty(0, np.int32)).shape == (0,)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 15, 16, 17, 1000])
+def test_rows_are_thinned_evenly(count):
+    """To so many, to so many at most, and to so many at least; the last two in steps of one size."""
+    numbers = np.arange(count)
+    spread, sparse, few = rows.spread(numbers, 8), rows.sparse(numbers, 8), numbers[rows.every_few(count, 8)]
+    assert len(spread) == min(count, 8) and np.array_equal(spread[-1:], numbers[-1:])
+    assert min(count, 5) <= len(sparse) <= 8 and min(count, 8) <= len(few) < 16
+    for chosen in (spread, sparse, few):
+        sizes = np.unique(np.diff(chosen))
+        assert len(sizes) <= (2 if chosen is spread else 1)
+        assert np.array_equal(chosen[:1], numbers[:1])

@@ -164,13 +164,6 @@ def test_stored_arrays_get_the_same_look_with_or_without_the_next_scan(tmp_path)
         assert (f" /{viewer.NEXT} " in text) == (target_points is not None)
 
 
-def test_residual_arrows_are_thinned_evenly_and_only_moving():
-    mask = np.arange(10_000) % 2 == 0
-    rows = viewer.thinned(mask, 3000)
-    assert mask[rows].all() and 2000 < len(rows) <= 3000
-    assert len(viewer.thinned(np.zeros(5, bool), 3000)) == 0
-
-
 def test_a_recording_of_a_full_scan_stays_small(tmp_path):
     path = tmp_path / "large.rrd"
     pair, result = next(drive(points_n=120_000))

@@ -8,6 +8,7 @@ from lidarflow.kernels import neighbours, tree, votes
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar.surface import CAP_M
 from lidarflow.lidar.view import View
+from lidarflow.rows import spread
 
 _EXPECTED_RADIUS_M = 0.5
 _VOTE_CELL_M = 0.2
@@ -42,13 +43,6 @@ def translations(
     body = tree.build(points)
     return [*_of_planes(shift), *shifts_expected(body, expected),
             *_of_votes(view, points, body, max_shift_m)]
-
-
-def spread(points: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of the points (N, …), evenly over their order."""
-    if len(points) <= count:
-        return points
-    return points[np.linspace(0, len(points) - 1, count).astype(int)]
 
 
 def _of_planes(shift: np.ndarray) -> list[np.ndarray]:

@@ -14,6 +14,7 @@ from lidarflow.lidar.acceptance import matches_agree, moves, seems_to_move
 from lidarflow.lidar.body import Body, Growth
 from lidarflow.lidar.surface import CAP_M, MIN_AGREEMENT, Misfit
 from lidarflow.lidar.view import View
+from lidarflow.rows import spread
 from lidarflow.types import MovingObject
 
 _MAX_SPEED_M_PER_S = 30.0  # over ground
@@ -111,7 +112,7 @@ def _best_starts(
     None where there are too few seeds, none explains them clearly better than ego-motion does, or the one
     that does moves them too little along the ground to be looked at further.
     """
-    chosen = [hypotheses.spread(cluster, _MAX_START_POINTS) for cluster in clusters]
+    chosen = [spread(cluster, _MAX_START_POINTS) for cluster in clusters]
     rows = [found.rows[cluster] for cluster in chosen]
     proposed = [
         (number, translation) for number, cluster in enumerate(chosen) if len(cluster) >= seeds.MIN_SEEDS

@@ -12,6 +12,7 @@ from lidarflow.kernels import registration as kernel
 from lidarflow.kernels.tree import Tree
 from lidarflow.lidar import preparation
 from lidarflow.open3d_import import open3d
+from lidarflow.rows import every_few
 
 _SCENE_VOXEL_SHARE = 0.04    # a voxel is at most this share of the median range: indoors all is smaller
 _NORMAL_RADIUS_VOXELS = 3.5
@@ -96,7 +97,7 @@ def robust_point_to_plane(
     Tukey's loss lets moving objects go. It is as wide as one reach after the other, the widest first. What is
     found within the last reach counts; before, some of the points, evenly over their order, lead there.
     """
-    leading = slice(None, None, max(len(source) // _LEADING_POINTS, 1))
+    leading = every_few(len(source), _LEADING_POINTS)
     some, of_all = source[leading], icp.nothing_known(len(source))
     motion, nearest = start, icp.nothing_known(len(some))
     for reach_m in reaches_m:
@@ -137,7 +138,7 @@ def point_to_point(source, target, reach_m: float, start: np.ndarray) -> np.ndar
 
 def overlap(source: np.ndarray, target: Tree, reach_m: float, target_from_source: np.ndarray) -> float:
     """Share of the source (N, 3) that comes within `reach_m` of the target, by a sample."""
-    sample = source[::max(len(source) // _OVERLAP_SAMPLE, 1)]
+    sample = source[every_few(len(source), _OVERLAP_SAMPLE)]
     return float(neighbours.any_within(
         target, pose.apply(target_from_source, sample), np.full(len(sample), reach_m)).mean())
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.kernels import neighbours, tree
-from lidarflow.lidar.hypotheses import spread
+from lidarflow.rows import spread
 
 _SAME_PLACE_M = 0.5      # points this near to where a track should be lie on it
 _MIN_SHARE = 0.3         # of an object's points must

@@ -4,6 +4,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.lidar.registration import Planes, overlap, robust_point_to_plane, thinned
+from lidarflow.rows import every_few
 
 # A sensor at 2 Hz comes so far in a street, or turns so far in a hand; one at 10 Hz does neither.
 _RINGS_M = (4.0, 8.0, 12.0)
@@ -19,7 +20,7 @@ def best_start(source: np.ndarray, target: np.ndarray, voxel_m: float, reach_m: 
     surfaces `reach_m` apart. Raises DataError where too few points are left.
     """
     points, planes = thinned(source, voxel_m), Planes.of(thinned(target, voxel_m), voxel_m)
-    points = points[::max(len(points) // _SAMPLE, 1)]
+    points = points[every_few(len(points), _SAMPLE)]
     ends = [robust_point_to_plane(points, planes, [reach_m], start) for start in _starts()]
     shares = [overlap(points, planes.tree, voxel_m, motion) for motion in ends]
     return ends[int(np.argmax(shares))]

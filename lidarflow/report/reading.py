@@ -116,6 +116,7 @@ def _figures(found: dict, run_dir: Path) -> dict:
 
 def evenly_chosen(count: int, most: int) -> list[int]:
     """At most `most` of the numbers below `count`, from first to last; the middle one for `most` = 1."""
+    # Rounded, not cut off as in rows.spread: where few are chosen, uneven steps show.
     if most == 1:
         return [count // 2]
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()

@@ -9,6 +9,7 @@ from lidarflow.errors import DataError
 from lidarflow.kernels import images
 from lidarflow.rgbd_config import ImagesConfig
 from lidarflow.rgbd_types import Camera, RgbdFrame, check_is
+from lidarflow.rows import sparse
 
 _NEAREST_M = 0.01    # nearer to the camera, or behind it, nothing is seen
 _SMALLEST_SIDE = 8   # pixels; a coarser level would have no gradients to speak of
@@ -31,8 +32,7 @@ class Level:
 
     def some_pixels(self, most: int) -> np.ndarray:
         """Numbers v W + u (N,) of pixels with depth, N ≤ `most`, evenly chosen."""
-        pixels = np.flatnonzero(self.points[..., 2])
-        return pixels[:: max(-(-len(pixels) // most), 1)]
+        return sparse(np.flatnonzero(self.points[..., 2]), most)
 
     def nearest_pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whether points (N, 3) [m] are in the image, and number v W + u (N,) of the nearest pixel or 0."""
