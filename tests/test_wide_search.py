@@ -62,5 +62,5 @@ def test_sparse_scans_are_not_searched_from_all_around(monkeypatch):
     source, target = (
         ego.Thinned.of(scan.points[np.random.default_rng(seed).random(len(scan.points)) < 0.1], CONFIG)
         for seed, scan in enumerate(scans))
-    monkeypatch.setattr(ego.wide_search, "best_start", lambda *_: pytest.fail("searched from all around"))
+    monkeypatch.setattr(ego.wide_search, "from_all_around", lambda _: pytest.fail("searched all around"))
     assert pose.translation_distance(ego.find(source, target, None, CONFIG.ego), motions[0]) < 0.05

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from lidarflow.lidar.registration import (
     overlap,
     reproducible,
     robust_point_to_plane,
-    thinned,
 )
 from lidarflow.types import Scan
 
@@ -72,11 +72,12 @@ def find(source: Thinned, target: Thinned, guess: np.ndarray | None, config: Ego
         best = _found(source, target, lambda: register(source, target, guess, _GUESS_OFF_M))
         if best.share >= _USUAL_OVERLAP and not _is_far_off(guess, best.motion):
             return reproducible(best.motion)
-    from_rest = _found(source, target, lambda: register(source, target))
+    coarse = cache(lambda: _coarse(source, target))
+    from_rest = _found(source, target, lambda: register(source, target, wide_search.from_rest(coarse())))
     is_settled = best is not None and _agree(best, from_rest)
     best = from_rest if best is None else best.or_better(from_rest)
     if best.share < _USUAL_OVERLAP and not is_settled and not _is_about_right(source, target, best):
-        best = _or_all_around(source, target, best)
+        best = _or_all_around(source, target, coarse, best)
     if best.refusal:
         raise best.refusal
     return reproducible(best.motion)
@@ -121,15 +122,11 @@ def _is_about_right(source: Thinned, target: Thinned, found: _Found) -> bool:
         source, target, found.motion, _COARSE_VOXELS) >= _ABOUT_RIGHT
 
 
-def _or_all_around(source: Thinned, target: Thinned, best: _Found) -> _Found:
+def _or_all_around(
+    source: Thinned, target: Thinned, coarse: Callable[[], wide_search.Coarse], best: _Found
+) -> _Found:
     """What is found from the best of many starts, if clearly more meets by it than by the best so far."""
-
-    def registration() -> np.ndarray:
-        start = wide_search.best_start(
-            source.points, target.points, _COARSE_VOXELS * target.voxel_m, _STAGES_VOXELS[0] * target.voxel_m)
-        return register(source, target, start)
-
-    found = _found(source, target, registration)
+    found = _found(source, target, lambda: register(source, target, wide_search.from_all_around(coarse())))
     if found.share < _SURELY_MEETS:
         return best
     # Wider than the last reach: rings travel with the sensor, and meet by whatever is nearly rest.
@@ -147,20 +144,22 @@ def register(
     than `start_off_m` off is not searched for wider than that. Raises DataError when the clouds have too
     little in common.
     """
-    voxel_m, target_from_source = target.voxel_m, start
     if start is None:
-        coarse_m = _COARSE_VOXELS * voxel_m
-        target_from_source = robust_point_to_plane(
-            thinned(source.points, coarse_m, source.name),
-            Planes.of(thinned(target.points, coarse_m, target.name), coarse_m),
-            [_STAGES_VOXELS[0] * voxel_m], np.eye(4))
-    reaches_m = [reach_voxels * voxel_m for reach_voxels in _STAGES_VOXELS[1:]]
+        start = wide_search.from_rest(_coarse(source, target))
+    reaches_m = [reach_voxels * target.voxel_m for reach_voxels in _STAGES_VOXELS[1:]]
     reaches_m = [reach_m for reach_m in reaches_m if reach_m <= start_off_m] or reaches_m[-1:]
     # In the order of a tree, points that follow one another meet planes that do.
     target_from_source = robust_point_to_plane(
-        source.planes.tree.points, target.planes, reaches_m, target_from_source)
+        source.planes.tree.points, target.planes, reaches_m, start)
     _require_overlap(source, target, target_from_source)
     return target_from_source
+
+
+def _coarse(source: Thinned, target: Thinned) -> wide_search.Coarse:
+    voxel_m = target.voxel_m
+    return wide_search.Coarse.of(
+        source.points, target.points, _COARSE_VOXELS * voxel_m, _STAGES_VOXELS[0] * voxel_m,
+        (source.name, target.name))
 
 
 def _require_overlap(source: Thinned, target: Thinned, target_from_source: np.ndarray) -> None:

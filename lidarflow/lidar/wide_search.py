@@ -1,4 +1,6 @@
-"""Where a registration of two scans begins when nothing is known and beginning at rest has led nowhere."""
+"""Where a registration of two scans begins when nothing is known: at rest, or from all around."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,16 +15,40 @@ _TURNS_RAD = (-1.0, -0.5, 0.5, 1.0)
 _SAMPLE = 1500               # points of the source; where they meet nothing, more do not either
 
 
-def best_start(source: np.ndarray, target: np.ndarray, voxel_m: float, reach_m: float) -> np.ndarray:
-    """Of many motions, target_from_source (4, 4), the one by which most of the source meets the target.
+@dataclass(frozen=True, slots=True, eq=False)
+class Coarse:
+    """Two scans thinned so far that all of one may be looked for in all of the other.
 
-    Points (N, 3) and (M, 3), metres, thinned to `voxel_m`, are registered from shifts and turns all around,
-    surfaces `reach_m` apart. Raises DataError where too few points are left.
+    source   (N, 3)   metres, source frame
+    target   Planes   target frame
+    voxel_m  float    that both are thinned to
+    reach_m  float    how far apart corresponding surfaces may be
     """
-    points, planes = thinned(source, voxel_m), Planes.of(thinned(target, voxel_m), voxel_m)
-    points = points[every_few(len(points), _SAMPLE)]
-    ends = [robust_point_to_plane(points, planes, [reach_m], start) for start in _starts()]
-    shares = [overlap(points, planes.tree, voxel_m, motion) for motion in ends]
+
+    source: np.ndarray
+    target: Planes
+    voxel_m: float
+    reach_m: float
+
+    @classmethod
+    def of(
+        cls, source: np.ndarray, target: np.ndarray, voxel_m: float, reach_m: float, names: tuple[str, str]
+    ) -> "Coarse":
+        """Of points (N, 3) and (M, 3); DataError, which says whose (`names`), where too few are left."""
+        points = thinned(source, voxel_m, names[0])
+        return cls(points, Planes.of(thinned(target, voxel_m, names[1]), voxel_m), voxel_m, reach_m)
+
+
+def from_rest(scans: Coarse) -> np.ndarray:
+    """target_from_source (4, 4) as it is found from the identity."""
+    return robust_point_to_plane(scans.source, scans.target, [scans.reach_m], np.eye(4))
+
+
+def from_all_around(scans: Coarse) -> np.ndarray:
+    """Of what is found from many shifts and turns, target_from_source (4, 4), that by which most meets."""
+    points = scans.source[every_few(len(scans.source), _SAMPLE)]
+    ends = [robust_point_to_plane(points, scans.target, [scans.reach_m], start) for start in _starts()]
+    shares = [overlap(points, scans.target.tree, scans.voxel_m, motion) for motion in ends]
     return ends[int(np.argmax(shares))]
 
 
