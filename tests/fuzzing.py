@@ -104,8 +104,12 @@ def corpus(folder):
          "alignment": {"before": 0.1, "by_ego": 0.2, "after": 0.3, "sigma_m": 0.1}, "scores": None,
          "truth": "none", "stats": asdict(STATS), "valid_share": 0.5}]}
     add(io.METRICS_FILE, text(json.dumps(report)),
-        lambda file: reading.read_figures(_renamed(file, io.METRICS_FILE)))
+        lambda file: _read_figures(_renamed(file, io.METRICS_FILE)))
     return made
+
+
+def _read_figures(run_dir):
+    return reading.figures_of(reading.read_metrics(run_dir), run_dir)
 
 
 def _renamed(file, name):

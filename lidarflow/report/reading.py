@@ -79,9 +79,9 @@ def read_run(run_dir: Path, most_pictured: int = MOST_PICTURED) -> Run:
     Raises DataError for a folder that is no run, and for files that are missing or damaged. Data that are not
     at hand any more only cost the error maps.
     """
-    found = _read_metrics(run_dir)
+    found = read_metrics(run_dir)
     source, config = provenance.read(run_dir), load(run_dir / io.CONFIG_FILE)
-    figures = _figures(found, run_dir)
+    figures = figures_of(found, run_dir)
     pairs, file = figures["pairs"], run_dir / io.METRICS_FILE
     if len(pairs) != len(source.pairs):
         raise DataError(f"{file}: {len(pairs)} pairs, but {io.SOURCE_FILE} names the scans of "
@@ -92,12 +92,8 @@ def read_run(run_dir: Path, most_pictured: int = MOST_PICTURED) -> Run:
                pictures=drawn, note=note)
 
 
-def read_figures(run_dir: Path) -> dict:
-    """What metrics.json of a run folder holds, by the names that `Run` has for it; DataError if damaged."""
-    return _figures(_read_metrics(run_dir), run_dir)
-
-
-def _figures(found: dict, run_dir: Path) -> dict:
+def figures_of(found: dict, run_dir: Path) -> dict:
+    """What was `found` in metrics.json of a run folder, by the names that `Run` has; DataError if damaged."""
     file = run_dir / io.METRICS_FILE
     try:
         return {
@@ -122,7 +118,7 @@ def evenly_chosen(count: int, most: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
-def _read_metrics(run_dir: Path) -> dict:
+def read_metrics(run_dir: Path) -> dict:
     """metrics.json of a run folder; DataError where the folder is no run, or the file cannot be read."""
     if not run_dir.is_dir():
         what = "is a file" if run_dir.exists() else "no such folder"
