@@ -66,6 +66,12 @@ def _estimate(
     source: tuple[pyramid.Level, ...], target: tuple[pyramid.Level, ...], previous: RgbdResult | None,
     config: RgbdConfig, timed: Stopwatch,
 ) -> RgbdResult:
+    """Odometry, segmentation and scene flow between two pyramids, finest level first; the method's main line.
+
+    Odometry for most of the image tells which clusters move; without them it is found again, and what moves
+    now is told anew, until the same clusters do. `previous` is the result of the pair before, `timed` adds up
+    the seconds of each stage. Raises DataError where the pyramids have too little in common.
+    """
     with timed("clusters"):
         clusters = geometric.find(source, config.clusters)
         b_before = None if previous is None else propagation.carried(previous, source[0], clusters)
