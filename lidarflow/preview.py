@@ -11,6 +11,7 @@ from lidarflow.types import FlowResult, Scan, ScanPair
 _TEXT = (220, 220, 220)
 _QUIET = (150, 150, 150)
 _SENSOR_M = 0.8
+_SCALE_BAR_M = 10.0
 
 
 def bird_eye(points: np.ndarray, colours: np.ndarray, is_dynamic: np.ndarray, residual_flow: np.ndarray,
@@ -162,12 +163,12 @@ def _overlap(a: tuple, b: tuple) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _draw_scale_bar(draw: ImageDraw.ImageDraw, scale: float, size_px: int, length_m: float = 10.0) -> None:
-    """A bar of `length_m` in the lower left corner."""
+def _draw_scale_bar(draw: ImageDraw.ImageDraw, scale: float, size_px: int) -> None:
+    """A bar in the lower left corner that says how long it is."""
     left, bottom = size_px // 50, size_px - size_px // 50
-    right, tick = left + length_m * scale, size_px // 150
+    right, tick = left + _SCALE_BAR_M * scale, size_px // 150
     draw.line([(left, bottom), (right, bottom)], fill=_QUIET, width=max(2, size_px // 600))
     for end in (left, right):
         draw.line([(end, bottom - tick), (end, bottom + tick)], fill=_QUIET, width=max(2, size_px // 600))
-    draw.text(((left + right) / 2, bottom - tick), f"{length_m:g} m", _QUIET, colour.font(size_px / 60),
+    draw.text(((left + right) / 2, bottom - tick), f"{_SCALE_BAR_M:g} m", _QUIET, colour.font(size_px / 60),
               anchor="mb")

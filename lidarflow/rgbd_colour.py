@@ -14,6 +14,7 @@ _NEAR_TO_FAR = np.array([(255, 245, 190), (252, 165, 80), (205, 65, 90), (115, 3
 _GOLDEN_RATIO = 0.618034
 _DARKEST = 0.5             # how much of a colour is left on a black surface
 _STILL_GREY = 0.75         # how bright still surfaces are drawn under motion
+_LEAST_FULL_M = 0.01       # shorter flow is never drawn at full strength
 
 
 def depth_range(depth: np.ndarray) -> tuple[float, float]:
@@ -65,12 +66,12 @@ def motion_colours(flow: np.ndarray, valid: np.ndarray, full_m: float,
     return _rounded(mixed * valid[..., None])
 
 
-def full_strength_m(flow: np.ndarray, valid: np.ndarray, least_m: float = 0.01) -> float:
+def full_strength_m(flow: np.ndarray, valid: np.ndarray) -> float:
     """The length that is drawn at full strength: nearly the longest of flow (H, W, 3), rounded up to 5 mm."""
     if not valid.any():
-        return least_m
+        return _LEAST_FULL_M
     long_m = float(np.quantile(np.linalg.norm(flow[valid], axis=-1), 0.99))
-    return max(least_m, float(np.ceil(long_m / 0.005) * 0.005))
+    return max(_LEAST_FULL_M, float(np.ceil(long_m / 0.005) * 0.005))
 
 
 def wheel(size_px: int, full_m: float) -> np.ndarray:

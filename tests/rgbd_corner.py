@@ -16,7 +16,7 @@ def texture(points: np.ndarray) -> np.ndarray:
     return 0.5 + 0.1 * np.sin(points @ WAVES.T + [0.0, 1.0, 2.0, 3.0]).sum(axis=-1)
 
 
-def frame(first_from_camera: np.ndarray, camera: Camera = QVGA, name: str = "corner") -> RgbdFrame:
+def frame(first_from_camera: np.ndarray, camera: Camera = QVGA) -> RgbdFrame:
     """What a camera at a pose sees of the corner."""
     rays = camera.points(np.ones((camera.height, camera.width), np.float32)).astype(float)
     directions, origin = pose.turn(first_from_camera, rays), first_from_camera[:3, 3]
@@ -24,7 +24,7 @@ def frame(first_from_camera: np.ndarray, camera: Camera = QVGA, name: str = "cor
         depths = (WALLS[:, 3] - WALLS[:, :3] @ origin) / (directions @ WALLS[:, :3].T)
     depth = np.where(depths > 0, depths, np.inf).min(axis=-1)
     points = origin + directions * depth[..., None]
-    return RgbdFrame(texture(points).astype(np.float32), depth.astype(np.float32), name=name)
+    return RgbdFrame(texture(points).astype(np.float32), depth.astype(np.float32), name="corner")
 
 
 def pair(target_from_source: np.ndarray, camera: Camera = QVGA) -> RgbdPair:

@@ -24,7 +24,8 @@ def some_stats(**changes):
     return SolveStats(solver="fast", stopped={"converged": 1}, **(numbers | changes))
 
 
-def some_result(count=5, seconds=1.0):
+def some_result(seconds=1.0):
+    count = 5
     rng = np.random.default_rng(2)
     points = rng.normal(size=(count, 3)) * 10
     motions = pose.exp(rng.normal(size=(count, 6)) * 0.3)

@@ -186,20 +186,20 @@ def look(source: Cloud, target: Cloud, matched: np.ndarray, moved: np.ndarray) -
     return replace(view_of_pair.look(source, target, CONFIG), matches=matches)
 
 
-def scene(car_shift: np.ndarray, seed: int, wall_shift: np.ndarray = (0.0, 0.0, 0.0)) -> view_of_pair.View:
-    """A view of a box 9 m ahead that moves by `car_shift`, and a wall at 14 m along which rings may slide."""
+def scene(car_shift: np.ndarray, seed: int) -> view_of_pair.View:
+    """A view of a box 9 m ahead that moves by `car_shift`, and a wall at 14 m."""
     random = rng(seed)
 
-    def returns(car: np.ndarray, along: np.ndarray) -> np.ndarray:
+    def returns(car: np.ndarray) -> np.ndarray:
         box = box_surface(1500, int(random.integers(1 << 30))) + [9.0, 0.0, 0.0] + car
-        background = wall(14.0, int(random.integers(1 << 30))) * [1.0, 2.0, 0.5] + along
+        background = wall(14.0, int(random.integers(1 << 30))) * [1.0, 2.0, 0.5]
         both = np.concatenate([box[box[:, 0] < 9.0 + car[0]], background])
         return both + random.normal(0.0, 0.01, both.shape)
 
-    source, target = returns(np.zeros(3), np.zeros(3)), returns(np.asarray(car_shift), np.asarray(wall_shift))
+    source, target = returns(np.zeros(3)), returns(car_shift)
     ground = np.column_stack([random.uniform(2, 16, 4000), random.uniform(-6, 6, 4000), np.full(4000, -0.8)])
     matched = np.arange(0, len(source), 20)
-    moved = source[matched] + np.where(source[matched, :1] < 13.0, car_shift, wall_shift)
+    moved = source[matched] + np.where(source[matched, :1] < 13.0, car_shift, 0.0)
     return look(cloud(source, ground, 0.5), cloud(target, ground, 0.5), matched, moved)
 
 

@@ -65,10 +65,10 @@ def save(path, image):
     return path
 
 
-def expected(images, camera=QVGA, scale=5000.0, settings=None):
+def expected(images):
     """The result of the pair in four files."""
-    source, target = (read_frame(*images[k:k + 2], scale) for k in (0, 2))
-    return rgbd.estimate_flow(RgbdPair(source, target, camera), settings or RgbdConfig())
+    source, target = (read_frame(*images[k:k + 2], 5000.0) for k in (0, 2))
+    return rgbd.estimate_flow(RgbdPair(source, target, QVGA))
 
 
 # What answers at once.

@@ -274,9 +274,9 @@ def test_truth_of_another_size_is_refused(folder, tmp_path):
     assert open_rgbd(place).truth(1) is None
 
 
-def write_images(place, color_name, depth_name, count=3, scale=1000):
-    """Frames of the room under names with a number, depth in pixels of 1/scale metre."""
-    for k in range(count):
+def write_images(place, color_name, depth_name, scale=1000):
+    """Three frames of the room under names with a number, depth in pixels of 1/scale metre."""
+    for k in range(3):
         frame = frames()[k][0]
         files = place / color_name.format(k), place / depth_name.format(k)
         for file, image in zip(files, (frame.color, (frame.depth * scale).astype(np.uint16)), strict=True):

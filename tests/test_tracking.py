@@ -17,8 +17,8 @@ def rng(seed: int) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def car(x: float, y: float, seed: int = 1) -> np.ndarray:
-    return rng(seed).uniform(-1, 1, (300, 3)) * [2.0, 0.9, 0.7] + [x, y, 0.0]
+def car(x: float, y: float) -> np.ndarray:
+    return rng(1).uniform(-1, 1, (300, 3)) * [2.0, 0.9, 0.7] + [x, y, 0.0]
 
 
 def test_ids_are_kept_and_new_objects_get_new_ones():
