@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lidarflow import methods, metrics, runner
+from lidarflow import methods, metrics, pair_reports
 from lidarflow.config import Config, to_dict
 from lidarflow.datasets import Dataset
 from lidarflow.errors import ConfigError, LidarflowError
@@ -85,7 +85,7 @@ def compare(
     runs = [MethodRun(name) for name in names]
     found = Comparison(runs, [], [], config)
     for index, pair, results in _pairs(dataset, frames, runs, config):
-        truth, origin = runner.find_truth(dataset, index, pair)
+        truth, origin = pair_reports.find_truth(dataset, index, pair)
         above_ground = features.masks(pair.source, config).standing
         for run, result in zip(runs, results, strict=True):
             run.figures.append(figures_of(pair, result, truth, above_ground, config.crispness.sigma_m))
@@ -98,8 +98,8 @@ def compare(
 
 def _leave_out_poorer_truth(found: Comparison) -> None:
     """Leave but crispness of pairs whose truth is poorer than that of others, which is known at the end."""
-    for k in runner.poorer(found.truth):
-        found.truth[k] = runner.NO_TRUTH
+    for k in pair_reports.poorer(found.truth):
+        found.truth[k] = pair_reports.NO_TRUTH
         for run in found.runs:
             run.figures[k] = {"crispness": run.figures[k]["crispness"]}
 

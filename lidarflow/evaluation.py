@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, metrics, provenance, runner
+from lidarflow import io, metrics, pair_reports, provenance
 from lidarflow.config import Config, load, updated
 from lidarflow.datasets import Dataset, Source
 from lidarflow.datasets.base import read_truth
 from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.errors import DataError
+from lidarflow.pair_reports import PairReport
 from lidarflow.provenance import RunSource
-from lidarflow.runner import PairReport
 from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
 _UNKNOWN = float("nan")
@@ -39,11 +39,11 @@ class Evaluation:
     @property
     def truth(self) -> str:
         """What the pairs were scored against."""
-        return runner.truth_of([report.truth for report in self.reports])
+        return pair_reports.truth_of([report.truth for report in self.reports])
 
     def metrics(self) -> dict:
         """What metrics.json holds."""
-        return runner.metrics_of(self.reports, self.config)
+        return pair_reports.metrics_of(self.reports, self.config)
 
 
 def evaluate_run(run_dir: Path, truth: Path | None = None, data: Path | None = None) -> Evaluation:
@@ -109,7 +109,7 @@ def known_pairs(run_dir: Path, numbers: Sequence[int]) -> Iterator[tuple[ScanPai
         pair = ScanPair(dataset.scan(index), dataset.scan(following))
         file = run_dir / io.FLOW_FOLDER / f"{pair.source.name}.npz"
         _check_points(file, io.load_flow(file).points, pair.source, dataset)
-        yield pair, runner.find_truth(dataset, index, pair)[0]
+        yield pair, pair_reports.find_truth(dataset, index, pair)[0]
 
 
 def _opened(source: Source | None, data: Path | None, needed: bool, run_dir: Path) -> Dataset | None:
@@ -140,14 +140,14 @@ def _from_dataset(
         points, result = _read(file)
         _check_points(file, points, source, dataset)
         if truth is None:
-            known, origin = runner.find_truth(dataset, index, ScanPair(source, target))
+            known, origin = pair_reports.find_truth(dataset, index, ScanPair(source, target))
         else:
             known = _given_truth(truth, source.name, len(source), len(run.pairs))
             origin = known.origin
         alignment = metrics.alignment(source, target, result, config.crispness.sigma_m)
         if following not in sources:
             _check_target(run_dir, dataset, source, target, alignment, recorded.get(source.name))
-        yield runner.report_result(source, result, None, alignment, known, origin)
+        yield pair_reports.report_result(source, result, None, alignment, known, origin)
     if left:
         raise DataError(f"{run_dir}: flow of {_some(sorted(left))}, which is no scan of {dataset.name} "
                         "that the run went through; is this the data of the run?")
@@ -201,7 +201,7 @@ def _from_files(
     if following is not None:
         target = Scan(io.load_flow(following).points, name=following.stem)
         alignment = metrics.alignment(source, target, result, config.crispness.sigma_m)
-    return runner.report_result(source, result, None, alignment, known, known.origin)
+    return pair_reports.report_result(source, result, None, alignment, known, known.origin)
 
 
 def _read(file: Path) -> tuple[np.ndarray, FlowResult]:
@@ -265,7 +265,7 @@ def _check_truths(place: str, reports: list[PairReport]) -> None:
     without = [report.frame for report in reports if report.scores is None]
     if len(without) == len(reports):
         raise DataError(f"{place}: no truth (neither flow, nor boxes and poses, nor poses); give --truth")
-    lacking = without or [reports[k].frame for k in runner.poorer([report.truth for report in reports])]
+    lacking = without or [reports[k].frame for k in pair_reports.poorer([report.truth for report in reports])]
     if lacking:
         raise DataError(f"{place}: no truth of {_some(lacking)}, but of the other scans; "
                         "get the missing truth, or run without these scans")

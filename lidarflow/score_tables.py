@@ -6,7 +6,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from lidarflow import runner
+from lidarflow import pair_reports
 from lidarflow.evaluation import Evaluation
 from lidarflow.metrics import (
     Accuracy,
@@ -25,7 +25,7 @@ _PER_CENT, _DEGREES = 100.0, 180.0 / np.pi
 def tables_of(done: Evaluation) -> list[Table]:
     """Every table that an evaluation fills."""
     scores = [report.scores for report in done.reports]
-    whole = runner.pooled(done.reports)
+    whole = pair_reports.pooled(done.reports)
     return [error_table(scores), *([] if whole is None else _pooled_tables(whole)),
             frame_table(scores, all_points=not done.config.objects.enabled)]
 

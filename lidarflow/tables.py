@@ -12,8 +12,9 @@ from lidarflow import pose, provenance, run_folder
 from lidarflow.compare import Comparison
 from lidarflow.config import Config, describe
 from lidarflow.metrics import Alignment
+from lidarflow.pair_reports import NO_TRUTH, PairReport, figures_of, mean_of, truth_of
 from lidarflow.resuming import damaged_files
-from lidarflow.runner import NO_TRUTH, Going, PairReport, figures_of, is_complete, mean_of, truth_of
+from lidarflow.runner import Going, is_complete
 from lidarflow.stepping import Skipped
 from lidarflow.types import FlowResult, ScanPair
 

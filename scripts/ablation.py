@@ -18,7 +18,7 @@ import numpy as np
 from evaluate import table
 
 from lidarflow import config as settings
-from lidarflow import pipeline, runner
+from lidarflow import pair_reports, pipeline, runner
 from lidarflow.datasets import Dataset, open_dataset
 from lidarflow.types import ScanPair
 
@@ -75,8 +75,8 @@ def scores(with_truth: list[Case], static: list[Case], config: settings.Config) 
 
 def _figures(case: Case, config: settings.Config) -> dict[str, float]:
     result = pipeline.estimate_flow(case.pair, config)
-    return runner.figures_of(
-        runner.report_pair(case.dataset, case.index, case.pair, result, config))
+    return pair_reports.figures_of(
+        pair_reports.report_pair(case.dataset, case.index, case.pair, result, config))
 
 
 def halved_and_doubled() -> Iterator[tuple[str, tuple[str, ...]]]:

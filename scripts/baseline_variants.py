@@ -15,7 +15,7 @@ from unittest import mock
 import numpy as np
 from evaluate import number, table
 
-from lidarflow import methods, metrics, runner, synthetic
+from lidarflow import methods, metrics, pair_reports, runner, synthetic
 from lidarflow.baselines import icp
 from lidarflow.config import Config, EgoConfig
 from lidarflow.datasets import open_dataset
@@ -93,7 +93,7 @@ def recorded(folder: Path, n_scans: int | None) -> Sequence:
     dataset = open_dataset(folder)
     frames = runner.choose_frames(dataset, 0, n_scans)
     scans = [dataset.scan(frame) for frame in frames]
-    truths = [runner.find_truth(dataset, frame, ScanPair(*scans[k:k + 2]))[0]
+    truths = [pair_reports.find_truth(dataset, frame, ScanPair(*scans[k:k + 2]))[0]
               for k, frame in enumerate(frames[:-1])]
     if None in truths:
         raise SystemExit(f"{folder}: no truth, neither flow nor poses; give a folder that has one")

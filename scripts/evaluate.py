@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow import config as settings
-from lidarflow import pipeline, runner
+from lidarflow import pair_reports, pipeline, runner
 from lidarflow.datasets import open_dataset
 
 SCORES = {
@@ -44,18 +44,18 @@ def evaluate(job: tuple[Path, int | None, settings.Config]) -> dict:
     for _ in pipeline.run(dataset, frames[:2], pipeline.FlowEstimator(config)):
         pass
     results = pipeline.run(dataset, frames, pipeline.FlowEstimator(config))
-    reports = runner.without_poorer_truth([
-        runner.report_pair(dataset, index, pair, result, config)
+    reports = pair_reports.without_poorer_truth([
+        pair_reports.report_pair(dataset, index, pair, result, config)
         for index, (pair, result) in zip(frames, results, strict=False)
     ])
     stages = dict.fromkeys(stage for report in reports for stage in report.seconds)
     return {
         "folder": folder.name,
         "pairs": len(reports),
-        "truth": runner.truth_of([report.truth for report in reports]),
+        "truth": pair_reports.truth_of([report.truth for report in reports]),
         "points": float(np.mean([report.points for report in reports])),
         "graph_points": float(np.mean([report.graph_points for report in reports])),
-        "scores": runner.mean_of(reports),
+        "scores": pair_reports.mean_of(reports),
         "seconds": {s: float(np.mean([r.seconds.get(s, 0.0) for r in reports])) for s in stages},
         "peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
     }

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow import config as settings
-from lidarflow import pose, runner
+from lidarflow import pair_reports, pose, runner
 from lidarflow.datasets import open_dataset
 from lidarflow.lidar import features, frontend, mesh
 from lidarflow.types import ScanPair
@@ -41,7 +41,7 @@ def evaluate_pair(dataset, index: int, config: settings.Config) -> str:
     graph = frontend.matched(graph, points, *matches.of(np.flatnonzero(graph.variable >= 0))).problem
     row = [f"{dataset.name} {pair.source.name}", found.method,
            f"{meshed_share(points, kept, found.component):.3f}", str(len(graph.match_index))]
-    truth, _ = runner.find_truth(dataset, index, pair)
+    truth, _ = pair_reports.find_truth(dataset, index, pair)
     if truth is None:
         return "| " + " | ".join([*row, "-"]) + " |"
     variable_rows = np.flatnonzero(np.isin(np.arange(len(points)), np.unique(found.edges)))

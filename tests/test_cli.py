@@ -20,9 +20,9 @@ from lidarflow import (
     demo,
     io,
     metrics,
+    pair_reports,
     pose,
     run_folder,
-    runner,
     synthetic,
     tables,
     viewer,
@@ -293,9 +293,10 @@ def test_the_widest_table_fits_80_columns(monkeypatch, capsys, enabled):
     part = metrics.MeanError(100, 0.1)
     scores = metrics.Scores(*[summary] * 5, *[metrics.Accuracy(*[0.1] * 5)] * 3,
                             metrics.ThreeWay(part, part, part, 1, 1, 1), None, (), (), *[0.1] * 7)
-    reports = [runner.PairReport(name, 123456, 5000, 123456, 42, 999, alignment, scores, "flow", None,
-                                 {"all": 999.9})
-               for name in ("0000000000", "315966265259836000")]
+    reports = [
+        pair_reports.PairReport(name, 123456, 5000, 123456, 42, 999, alignment, scores, "flow", None,
+                                {"all": 999.9})
+        for name in ("0000000000", "315966265259836000")]
     monkeypatch.setenv("COLUMNS", "80")
     cli._print(tables.run_table(reports, config.load(overrides=OVERRIDES[enabled])))
     out = capsys.readouterr().out

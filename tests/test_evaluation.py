@@ -10,7 +10,7 @@ from cloud_files import write_bin
 from command_line import drive, rests
 from run_folders import OFF_M, write_run
 
-from lidarflow import evaluation, metrics, provenance, runner, synthetic
+from lidarflow import evaluation, metrics, pair_reports, provenance, synthetic
 from lidarflow.datasets import open_dataset
 from lidarflow.types import Scan, Truth
 
@@ -152,11 +152,11 @@ def test_a_run_takes_no_poses_for_truth_beside_a_better_one(lidarflow, data, tmp
 def test_figures_of_two_kinds_of_truth_are_not_pooled(data, run):
     done = evaluation.evaluate_run(run)
     first, second = done.reports
-    assert runner.pooled(done.reports) is not None
-    assert runner.pooled([first, replace(second, truth="boxes")]) is None
-    assert runner.truth_of(["boxes", "flow", "flow"]) == "boxes (1 pair), flow (2 pairs)"
-    assert runner.poorer(["flow", metrics.POSES_ONLY, "none"]) == [1]
-    assert runner.poorer(["none", metrics.POSES_ONLY]) == []
+    assert pair_reports.pooled(done.reports) is not None
+    assert pair_reports.pooled([first, replace(second, truth="boxes")]) is None
+    assert pair_reports.truth_of(["boxes", "flow", "flow"]) == "boxes (1 pair), flow (2 pairs)"
+    assert pair_reports.poorer(["flow", metrics.POSES_ONLY, "none"]) == [1]
+    assert pair_reports.poorer(["none", metrics.POSES_ONLY]) == []
 
 
 def test_classes_of_the_truth_are_scored(lidarflow, data, run):

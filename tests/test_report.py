@@ -16,12 +16,12 @@ from PIL import Image
 from run_folders import CONFIG, OFF_M, write_run
 from test_preview import MOVER, street
 
-from lidarflow import evaluation, io, metrics, preview, provenance, report, runner, synthetic
+from lidarflow import evaluation, io, metrics, pair_reports, preview, provenance, report, synthetic
 from lidarflow.datasets import open_dataset
+from lidarflow.pair_reports import PairReport
 from lidarflow.report import pictures, plots, reading
 from lidarflow.report.page import settings_tables
 from lidarflow.report.rebuilding import rebuilt
-from lidarflow.runner import PairReport
 from lidarflow.types import Truth
 
 pytestmark = pytest.mark.usefixtures("in_tmp_path")
@@ -225,8 +225,8 @@ def without_truth(scans, run):
     for scan, following in itertools.pairwise(scans):
         found = io.load_flow(run / "flow" / f"{scan.name}.npz").result()
         aligned = metrics.alignment(scan, following, found, CONFIG.crispness.sigma_m)
-        reports.append(runner.report_result(scan, found, 5, aligned, None, "none"))
-    return runner.metrics_of(reports, CONFIG)
+        reports.append(pair_reports.report_result(scan, found, 5, aligned, None, "none"))
+    return pair_reports.metrics_of(reports, CONFIG)
 
 
 def test_data_that_are_gone_cost_only_the_error_maps(lidarflow, run, tmp_path):

@@ -11,10 +11,10 @@ from lidarflow import evaluation, io, metrics, provenance
 from lidarflow.config import Config, load
 from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.errors import DataError, LidarflowError
+from lidarflow.pair_reports import PairReport
 from lidarflow.provenance import RunSource
 from lidarflow.report import pictures
 from lidarflow.report.rebuilding import rebuilt
-from lidarflow.runner import PairReport
 from lidarflow.types import Scan, ScanPair, Truth
 
 MOST_PICTURED, _MOST_ON_A_PAGE = 6, 12
