@@ -12,23 +12,24 @@ _FAR_M = 1.0   # distances to the next scan count at most this much
 
 def detect(
     points: np.ndarray, residual_flow: np.ndarray, candidates: np.ndarray, edges: np.ndarray,
-    ego_motion: np.ndarray, target_surface: np.ndarray, dt_s: float, config: DynamicConfig,
+    ego_motion: np.ndarray, target_points: np.ndarray, dt_s: float, config: DynamicConfig,
 ) -> np.ndarray:
     """Mask (N,) of the points that move over ground.
 
-    points (N, 3) and residual_flow (N, 3) in metres; candidates (N,) bool, the solved points of the graph;
-    edges (E, 2) of the mesh; target_surface (S, 3), the next scan. A point moves when its residual flow,
-    averaged over the mesh, is fast enough, and when the points around it are farther from the next scan
-    after ego-motion alone than after their own flow.
+    points (N, 3), metres, source frame; residual_flow (N, 3), metres, in the target's axes; candidates (N,)
+    bool, the solved points of the graph; edges (E, 2) of the mesh; ego_motion (4, 4), target_from_source;
+    target_points (M, 3), the next scan in range, ground included, target frame. A point moves when its
+    residual flow, averaged over the mesh, is fast enough, and when the points around it are farther from the
+    next scan after ego-motion alone than after their own flow.
     """
     moving = np.zeros(len(points), bool)
     rows = np.flatnonzero(candidates)
-    if len(rows) == 0 or len(target_surface) == 0:
+    if len(rows) == 0 or len(target_points) == 0:
         return moving
     smooth = _Smoother(rows, edges, len(points), config.smoothing_rounds)
     speed = np.linalg.norm(smooth(residual_flow[rows]), axis=1) / dt_s
 
-    tree = cKDTree(target_surface)
+    tree = cKDTree(target_points)
     by_ego = pose.apply(ego_motion, points[rows])
     left_by_ego, _ = tree.query(by_ego, distance_upper_bound=_FAR_M, workers=-1)
     left_by_flow, _ = tree.query(by_ego + residual_flow[rows], distance_upper_bound=_FAR_M, workers=-1)

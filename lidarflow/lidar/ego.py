@@ -36,7 +36,13 @@ _MIN_OVERLAP = 0.3           # of the source within the third stage's reach of t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thinned:
-    """A scan for registration: points (M, 3), means per voxel in metres, their planes, what it is called."""
+    """A scan for registration.
+
+    points   (M, 3)   means per voxel, metres, sensor frame
+    planes   Planes   of these
+    voxel_m  float
+    name     str      what messages call it
+    """
 
     points: np.ndarray
     planes: Planes

@@ -13,19 +13,19 @@ from lidarflow.silence import silenced
 _PATCHWORK_HEIGHT_M = 1.723   # the height Patchwork++ is tuned for; clouds are shifted to it
 _PATCHWORK_MIN_RANGE_M = 1.0
 _PATCHWORK_MAX_RANGE_M = 80.0   # bounds the area that cells are laid over
-_CELL_M = 2.0
-_NEAR_M = 20.0
-_MIN_CELL_POINTS = 5
-_MIN_CLOUD_POINTS = 50
-_LOW_SHARE = 0.1
-_REFLECTION_DEPTH_M = 0.5
-_FILL_NEIGHBOURS = 8
-_FILL_RADIUS_M = 2.0
-_PLANE_RADIUS_M = 15.0   # so far around the sensor ground is about a plane,
-_PLANE_SCALE_M = 0.15    # to about so much,
-_PLANE_POINTS = 1000     # which as many points tell as well as all
+_CELL_M = 2.0                   # of the cells that low ground is looked for in
+_NEAR_M = 20.0                  # ground this near to the sensor says how high it is
+_MIN_CELL_POINTS = 5            # in a cell that has a say in that
+_MIN_CLOUD_POINTS = 50          # in fewer no ground is looked for
+_LOW_SHARE = 0.1                # of a cell's points may be lower than its low ground
+_REFLECTION_DEPTH_M = 0.5       # what is deeper below the ground around it is a reflection
+_FILL_NEIGHBOURS = 8            # ground points whose median says how high the ground around a place is
+_FILL_RADIUS_M = 2.0            # if so many are this near
+_PLANE_RADIUS_M = 15.0          # so far around the sensor ground is about a plane,
+_PLANE_SCALE_M = 0.15           # to about so much,
+_PLANE_POINTS = 1000            # which as many points tell as well as all
 _PLANE_ROUNDS = 8
-_BEND_RADIUS_M = 50.0    # of a road that rises from it: no street bends more
+_BEND_RADIUS_M = 50.0           # of a road that rises from it: no street bends more
 
 
 @dataclass(frozen=True, slots=True, eq=False)

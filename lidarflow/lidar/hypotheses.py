@@ -10,12 +10,12 @@ from lidarflow.lidar.surface import CAP_M
 from lidarflow.lidar.view import View
 from lidarflow.rows import spread
 
-_EXPECTED_RADIUS_M = 0.5
-_VOTE_CELL_M = 0.2
-_VOTE_PEAKS = 3
-_MAX_VOTERS = 150
-_MIN_APPEARED = 4
-_MIN_SHIFTED = 5
+_EXPECTED_RADIUS_M = 0.5   # seeds this near to where an object should be may be on it
+_VOTE_CELL_M = 0.2         # translations within one cell are one
+_VOTE_PEAKS = 3            # translations with most votes that are proposed
+_MAX_VOTERS = 150          # seeds that vote, each for every newcomer near by; of those, twice as many
+_MIN_APPEARED = 4          # fewer newcomers are no surface that has moved there
+_MIN_SHIFTED = 5           # and fewer planes tell no shift
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -78,5 +78,5 @@ def _kiss_icp(limits):
     config = KISSConfig()
     config.data.min_range, config.data.max_range = limits.min_range_m, limits.max_range_m
     config.data.deskew = False   # flow is between the points as they were measured
-    config.mapping.voxel_size = limits.max_range_m / 100.0
+    config.mapping.voxel_size = limits.max_range_m / 100.0   # as its own loader of settings has it
     return KissICP(config)

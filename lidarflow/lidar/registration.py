@@ -21,15 +21,15 @@ _NORMAL_RADIUS_VOXELS = 3.5
 # it, and say that it rests. What is narrower than this, as a standard deviation, has the normal of the
 # ground where it is level, and none where it is not.
 _MIN_WIDTH_VOXELS = 0.2
-_MIN_POINTS = 30
+_MIN_POINTS = 30             # of a scan, and of pairs that a step rests on
 _SETTLED = 1e-5              # a step that stays below it, in metres and radians, ends a registration
 _NEARLY_SETTLED = 1e-4       # and that ends a stage another one follows
 _SETTLED_SHARE = 1e-7        # relative change of fit and residual that ends a point-to-point ICP
 _MOST_ROUNDS = 30
 _LEADING_POINTS = 8000       # points that lead a registration to its last reach, about
 _OVERLAP_SAMPLE = 2000       # points; they tell a share to 0.02
-_HOLD = 1e-9
-_REPRODUCIBLE_DECIMALS = 9
+_HOLD = 1e-9                 # share of the normal equations' trace that is added to their diagonal
+_REPRODUCIBLE_DECIMALS = 9   # of metres and radians
 
 
 def voxel_for(points: np.ndarray, wanted_m: float) -> float:
@@ -125,8 +125,11 @@ def _settled(
     return motion
 
 
-def point_to_point(source, target, reach_m: float, start: np.ndarray) -> np.ndarray:
-    """target_from_source (4, 4) of points (N, 3) from `start` (4, 4), by nearest points within `reach_m`."""
+def point_to_point(source: np.ndarray, target: np.ndarray, reach_m: float, start: np.ndarray) -> np.ndarray:
+    """target_from_source (4, 4) of points (N, 3) onto points (M, 3), metres, by ICP from `start` (4, 4).
+
+    A point's counterpart is the nearest one within `reach_m`.
+    """
     o3d = open3d()
     registration = o3d.pipelines.registration
     method = registration.TransformationEstimationPointToPoint()

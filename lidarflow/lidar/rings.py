@@ -14,7 +14,10 @@ _MIN_RANGE_M = 0.1
 # 1.5 of 26 degrees on an HDL-64E.
 _MAX_RING_PITCH_SHARE = 0.1
 _MAX_SHARE_IN_WIDE_RINGS = 0.1   # of the points
-_MAX_STEP_RAD = np.radians(10.0)
+_MAX_STEP_RAD = np.radians(10.0)   # from a point to the next of its ring; larger ones are gaps, or the cut
+_MIN_SHARE_OF_STEPS = 0.9          # that are no larger, in a file of one revolution after another
+_SAME_PITCH_RAD = np.radians(0.08)  # nominal beams lie farther apart than this
+_MIN_SHARE_IN_RINGS = 0.95         # of the points, where pitch alone tells rings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +59,7 @@ def _from_file_order(azimuth: np.ndarray, pitch: np.ndarray) -> tuple[np.ndarray
     """Lasers (P,) and spacing of a file of one revolution after another (KITTI, row-major images)."""
     step = kernel.steps(azimuth)
     direction, step_size = np.sign(median(step)), np.abs(step)
-    if direction == 0 or np.count_nonzero(step_size < _MAX_STEP_RAD) / len(step) < 0.9:
+    if direction == 0 or np.count_nonzero(step_size < _MAX_STEP_RAD) / len(step) < _MIN_SHARE_OF_STEPS:
         return None
     # Half a step before the first point, so that a ring that starts beside it starts behind the cut. A high
     # ring may see one house, and no cut.
@@ -75,10 +78,10 @@ def _from_pitch(pitch: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Lasers (P,), or -1, and spacing where pitch takes few values (nominal beam angles, any file order)."""
     order = np.argsort(pitch, kind="stable")
     ascending = pitch[order]
-    starts = np.flatnonzero(np.diff(ascending) > np.radians(0.08)) + 1
+    starts = np.flatnonzero(np.diff(ascending) > _SAME_PITCH_RAD) + 1
     counts = np.diff(np.concatenate([[0], starts, [len(pitch)]]))
     is_large = counts >= _MIN_POINTS_PER_RING
-    if counts[is_large].sum() < 0.95 * len(pitch):
+    if counts[is_large].sum() < _MIN_SHARE_IN_RINGS * len(pitch):
         return None
     lasers = _lasers(
         ascending[np.repeat(is_large, counts)], np.concatenate([[0], np.cumsum(counts[is_large])]))

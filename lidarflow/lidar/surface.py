@@ -64,7 +64,7 @@ class Misfit:
     """How far points are from a surface.
 
     distance_m  (N,)      to its nearest point, at most CAP_M
-    plane_m     (N,)      to the plane of that point where the normals agree, else as distance_m
+    plane_m     (N,)      to the plane of that point where the normals agree, else as distance_m; never more
     """
 
     distance_m: np.ndarray
