@@ -85,8 +85,8 @@ def _terminate(number: int, frame: object) -> None:
 
 def _leave_what_is_stalled() -> None:
     """End the program at once where the usual way waits for ever for a recording that cannot be written."""
-    viewer = sys.modules.get("lidarflow.viewer")
-    if viewer is not None and viewer.stalled:
+    streams = sys.modules.get("lidarflow.rerun_streams")
+    if streams is not None and streams.stalled:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(1)
@@ -262,7 +262,7 @@ def view(
     import shutil
     import tempfile
 
-    from lidarflow import io, rgbd_io, run_folder, viewer
+    from lidarflow import io, rerun_streams, rgbd_io, run_folder
 
     _check_exists(what, "a run folder, a recording (.rrd) or a flow file (.npz)")
     if save is not None:
@@ -271,9 +271,9 @@ def view(
         if target is not None:
             raise DataError(f"--target {target}: is for a flow file; {what} holds its clouds already")
         recording = run_folder.find_recording(what)
-        viewer.check_recording(recording)
+        rerun_streams.check_recording(recording)
         if save is None:
-            viewer.open_in_viewer(recording)
+            rerun_streams.open_in_viewer(recording)
         else:
             with io.written_aside(save) as aside:
                 shutil.copyfile(recording, aside)
@@ -283,11 +283,11 @@ def view(
         print(f"recording  {save}")
     else:
         rgbd_io.load_flow(what) if rgbd_io.is_rgbd_flow(what) else io.load_flow(what)
-        viewer.require_display(f"make a recording with: lidarflow view {what} --save FILE.rrd")
+        rerun_streams.require_display(f"make a recording with: lidarflow view {what} --save FILE.rrd")
         with tempfile.TemporaryDirectory() as folder:
             recording = Path(folder) / "flow.rrd"
             _record_flow_file(what, target, recording)
-            viewer.open_in_viewer(recording)
+            rerun_streams.open_in_viewer(recording)
 
 
 @app.command()
@@ -332,17 +332,17 @@ def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None
     """Log one pair to a file, the live viewer, or both."""
     import numpy as np
 
-    from lidarflow import io, viewer
+    from lidarflow import io, rerun_streams, viewer
 
     with contextlib.ExitStack() as stack:
         aside = None if recording is None else stack.enter_context(io.written_aside(recording))
         stream = viewer.open_recording(aside, spawn=visualize)
-        stack.callback(viewer.close, stream, aside)
+        stack.callback(rerun_streams.close, stream, aside)
         viewer.log_pair(stream, 0, scans, result, (alignment.before, alignment.after), np.eye(4), arrows)
 
 
 def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
-    from lidarflow import datasets, io, rgbd_io, viewer
+    from lidarflow import datasets, io, rerun_streams, rgbd_io, viewer
 
     if rgbd_io.is_rgbd_flow(file):
         _record_rgbd_file(file, target, recording)
@@ -353,7 +353,7 @@ def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
     with io.written_aside(recording) as aside:
         stream = viewer.open_recording(aside)
         viewer.log_flow(stream, found.points, found.flow, found.is_dynamic, found.ego_motion, 0.1, points)
-        viewer.close(stream, aside)
+        rerun_streams.close(stream, aside)
 
 
 def _assumed(source: Path, target: Path, kitti_correction: str) -> str:
@@ -365,7 +365,7 @@ def _assumed(source: Path, target: Path, kitti_correction: str) -> str:
 
 
 def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:
-    from lidarflow import io, rgbd_io, rgbd_viewer, viewer
+    from lidarflow import io, rerun_streams, rgbd_io, rgbd_viewer
 
     if target is not None:
         raise DataError(f"--target {target}: {file} is of RGB-D images, which need no target to be shown")
@@ -373,4 +373,4 @@ def _record_rgbd_file(file: Path, target: Path | None, recording: Path) -> None:
     with io.written_aside(recording) as aside:
         stream = rgbd_viewer.open_recording(aside)
         rgbd_viewer.log_file(stream, found)
-        viewer.close(stream, aside)
+        rerun_streams.close(stream, aside)

@@ -8,10 +8,9 @@ leaves. The world is the first camera's frame: x right, y down, z forward.
 from pathlib import Path
 
 import numpy as np
-import rerun as rr
-import rerun.blueprint as rrb
 
-from lidarflow import colour, pose, rgbd_colour, rgbd_io, viewer
+from lidarflow import colour, pose, rgbd_colour, rgbd_io
+from lidarflow.rerun_streams import FRAME, all_until_now, open_stream, rr, rrb, set_times
 from lidarflow.rgbd_metrics import WarpScores
 from lidarflow.rgbd_types import RgbdPair, RgbdResult
 from lidarflow.rows import sparse
@@ -31,7 +30,7 @@ _IMAGE_PLANE_M = 0.25
 
 def open_recording(path: Path | None, spawn: bool = False) -> rr.RecordingStream:
     """A stream of RGB-D pairs that writes to the file `path`, to a viewer it starts (`spawn`), or to both."""
-    stream = viewer.open_stream(path, "lidarflow rgbd", spawn, blueprint())
+    stream = open_stream(path, "lidarflow rgbd", spawn, blueprint())
     stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
     for stage, rgb in _STAGES.items():
         for series in (rr.SeriesLines(colors=rgb, names=stage, widths=2.0),
@@ -43,7 +42,7 @@ def open_recording(path: Path | None, spawn: bool = False) -> rr.RecordingStream
 def log_pair(stream: rr.RecordingStream, index: int, pair: RgbdPair, result: RgbdResult, scores: WarpScores,
              world_from_source: np.ndarray) -> None:
     """Log one pair as frame `index`; world_from_source (4, 4) is where the source frame was taken."""
-    viewer.set_times(stream, index, pair)
+    set_times(stream, index, pair)
     dt_s = (pair.target.time_ns - pair.source.time_ns) * 1e-9
     full_m = FULL_SPEED_M_PER_S * dt_s if dt_s > 0 else None
     color = rgbd_io.color_at(pair.source, result.camera.width, result.camera.height)
@@ -55,7 +54,7 @@ def log_pair(stream: rr.RecordingStream, index: int, pair: RgbdPair, result: Rgb
 def log_file(stream: rr.RecordingStream, found: rgbd_io.RgbdFlowFile) -> None:
     """Log a flow file as frame 0, with the look of `log_pair`."""
     stream.send_blueprint(blueprint(with_residuals=False))
-    stream.set_time(viewer.FRAME, sequence=0)
+    stream.set_time(FRAME, sequence=0)
     log_result(stream, found.color, found.result, pose.identity())
 
 
@@ -95,7 +94,7 @@ def blueprint(with_residuals: bool = True) -> rrb.Blueprint:
         name="Points by their own motion", origin=WORLD, background=background, line_grid=False,
         eye_controls=rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=(-0.9, -0.9, -1.4),
                                        look_target=(0.0, 0.1, 2.0), eye_up=(0.0, -1.0, 0.0)),
-        overrides={TRAJECTORY: viewer.all_until_now()})
+        overrides={TRAJECTORY: all_until_now()})
     images = [rrb.Spatial2DView(name=name, origin=origin, background=background) for name, origin in (
         ("Colour", PHOTO), ("Depth", DEPTH), ("Clusters", CLUSTERS),
         ("Static (blue) or moving (red)", SEGMENTATION), ("Total flow", FLOW))]
@@ -104,7 +103,7 @@ def blueprint(with_residuals: bool = True) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(scene, side, column_shares=[1, 1]),
         rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=viewer.FRAME, fps=10.0))
+        rrb.TimePanel(state="collapsed", timeline=FRAME, fps=10.0))
 
 
 def _log_camera(stream: rr.RecordingStream, color: np.ndarray, result: RgbdResult,

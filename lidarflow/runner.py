@@ -228,10 +228,10 @@ def recording(path: Path, viewing: Viewing, open_recording: Callable):
     if not (viewing.record or viewing.visualize):
         yield None
         return
-    from lidarflow import viewer
+    from lidarflow import rerun_streams
 
     with contextlib.ExitStack() as stack:
         aside = stack.enter_context(io.written_aside(path)) if viewing.record else None
         stream = open_recording(aside, viewing.visualize)
-        stack.callback(viewer.close, stream, aside)
+        stack.callback(rerun_streams.close, stream, aside)
         yield stream

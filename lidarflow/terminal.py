@@ -103,6 +103,6 @@ def announce_first_use() -> None:
 def check_live_view(wanted: bool) -> None:
     """InstallError before any work where a viewer is wanted and none can be opened."""
     if wanted:
-        from lidarflow import viewer
+        from lidarflow import rerun_streams
 
-        viewer.require_live_view()
+        rerun_streams.require_live_view()

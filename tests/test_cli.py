@@ -22,10 +22,10 @@ from lidarflow import (
     metrics,
     pair_reports,
     pose,
+    rerun_streams,
     run_folder,
     synthetic,
     tables,
-    viewer,
 )
 
 CONTRACT = {"flow": ("float32", (3,)), "motion": ("float32", (7,)), "valid": ("bool", ()),
@@ -385,8 +385,9 @@ def test_view_saves_a_copy_of_a_runs_recording(lidarflow, finished, tmp_path):
 
 def test_view_opens_what_it_is_given(lidarflow, finished, monkeypatch):
     opened = []
-    monkeypatch.setattr(viewer, "open_in_viewer", lambda file: opened.append((file.name, file.is_file())))
-    monkeypatch.setattr(viewer, "require_display", lambda instead: None)
+    monkeypatch.setattr(
+        rerun_streams, "open_in_viewer", lambda file: opened.append((file.name, file.is_file())))
+    monkeypatch.setattr(rerun_streams, "require_display", lambda instead: None)
     for what in (finished[0], finished[0] / "recording.rrd", finished[0] / "flow" / "000001.npz"):
         lidarflow.ok("view", what)
     assert opened == [("recording.rrd", True), ("recording.rrd", True), ("flow.rrd", True)]
@@ -396,7 +397,7 @@ def test_view_opens_what_it_is_given(lidarflow, finished, monkeypatch):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux sessions can lack a display")
 def test_without_a_display_the_way_out_is_named(lidarflow, finished, scans, tmp_path, monkeypatch):
-    monkeypatch.setattr(viewer, "_viewer_listens", lambda: False)
+    monkeypatch.setattr(rerun_streams, "_viewer_listens", lambda: False)
     flow_file, out = finished[0] / "flow" / "000000.npz", tmp_path / "out"
     assert f"rerun --web-viewer {finished[0] / 'recording.rrd'}" in lidarflow.complaint("view", finished[0])
     assert f"lidarflow view {flow_file} --save" in lidarflow.complaint("view", flow_file)

@@ -18,7 +18,7 @@ LAYERS = [
     {"lidar", "rgbd", "solve", "datasets", "synthetic"},
     {"baselines"},
     {"pipeline", "rgbd_methods"},
-    {"methods"},
+    {"methods", "rerun_streams"},
     {"metrics", "rgbd_metrics", "io", "viewer", "preview", "rgbd_preview"},
     {"pair_reports", "provenance", "rgbd_io", "checkpoints", "trajectory", "run_folder"},
     {"rgbd_viewer", "rgbd_checkpoints", "resuming", "stepping"},
@@ -86,7 +86,7 @@ def test_modules_import_only_from_layers_to_their_left(module):
 @every_module
 def test_heavy_or_replaceable_packages_have_one_door(module):
     name = module.relative_to(PACKAGE).as_posix()
-    doors = {"gtsam": {"solve/gtsam_lm.py"}, "rerun": {"viewer.py", "rgbd_viewer.py"},
+    doors = {"gtsam": {"solve/gtsam_lm.py"}, "rerun": {"rerun_streams.py"},
              "open3d": {"open3d_import.py"}}
     for package in {imported.split(".")[0] for imported in imports(module)} & doors.keys():
         assert name in doors[package], f"{name} imports {package}"
@@ -94,7 +94,7 @@ def test_heavy_or_replaceable_packages_have_one_door(module):
 
 def test_the_doors_are_found():
     assert "gtsam" in imports(PACKAGE / "solve" / "gtsam_lm.py")
-    assert "rerun" in imports(PACKAGE / "viewer.py")
+    assert "rerun" in imports(PACKAGE / "rerun_streams.py")
     assert ours(PACKAGE / "lidar" / "mesh.py") >= {"config", "errors", "kernels", "lidar"}
 
 

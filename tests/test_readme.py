@@ -9,7 +9,7 @@ from command_line import Program, drive
 from rgbd_worlds import QVGA, frames
 from shared_data import ROOT
 
-from lidarflow import synthetic, viewer
+from lidarflow import rerun_streams, synthetic
 from lidarflow.config import read_toml
 from lidarflow.datasets.clouds import _READERS
 from lidarflow.export import FORMATS
@@ -46,8 +46,8 @@ def lidarflow(monkeypatch, capsys, place):
 @pytest.mark.slow
 def test_every_command_works_in_the_order_of_the_page(lidarflow, place, monkeypatch):
     opened = []
-    monkeypatch.setattr(viewer, "open_in_viewer", opened.append)
-    monkeypatch.setattr(viewer, "require_display", lambda *_: None)
+    monkeypatch.setattr(rerun_streams, "open_in_viewer", opened.append)
+    monkeypatch.setattr(rerun_streams, "require_display", lambda *_: None)
     tried = [command for command in COMMANDS if not any(mark in command for mark in ELSEWHERE)]
     assert len(tried) >= 14 and {shlex.split(command)[0] for command in tried} >= {
         "pair", "view", "run", "eval", "report", "compare", "export", "config", "rgbd"}

@@ -9,7 +9,7 @@ import pytest
 import rerun as rr
 from PIL import Image
 
-from lidarflow import colour, pose, rgbd_colour, rgbd_io, rgbd_preview, rgbd_viewer, viewer
+from lidarflow import colour, pose, rerun_streams, rgbd_colour, rgbd_io, rgbd_preview, rgbd_viewer
 from lidarflow.rgbd_metrics import Residuals, WarpScores
 from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult
 
@@ -159,7 +159,7 @@ def test_a_recording_is_valid_and_holds_every_entity_and_its_blueprint(tmp_path)
     for k, (pair, result) in enumerate(scene(count=2)):
         rgbd_viewer.log_pair(stream, k, pair, result, SCORES, world_from_camera)
         world_from_camera = world_from_camera @ pose.inverse(result.odometry)
-    viewer.close(stream)
+    rerun_streams.close(stream)
     printed(path, "verify")
     text = printed(path, "print", "-v")
     for entity in (rgbd_viewer.POINTS, rgbd_viewer.ARROWS, rgbd_viewer.PHOTO, rgbd_viewer.DEPTH,

@@ -1,15 +1,12 @@
-import os
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import rerun as rr
 
-from lidarflow import pose, viewer
-from lidarflow.errors import DataError, InstallError
+from lidarflow import pose, rerun_streams, viewer
 from lidarflow.types import FlowResult, MovingObject, Scan, ScanPair, SolveStats
 
 
@@ -46,7 +43,7 @@ def record(path, **options):
     for k, (pair, result) in enumerate(drive()):
         viewer.log_pair(stream, k, pair, result, (0.5, 0.7 + 0.1 * k), world_from_source, **options)
         world_from_source = world_from_source @ pose.inverse(result.ego_motion)
-    viewer.close(stream)
+    rerun_streams.close(stream)
 
 
 def with_object(pair, result):
@@ -97,7 +94,7 @@ def test_moving_objects_are_boxes_and_arrows(tmp_path):
     stream = viewer.open_recording(tmp_path / "objects.rrd")
     viewer.log_pair(stream, 0, pair, with_object(pair, result), None, pose.identity())
     viewer.log_pair(stream, 1, pair, result, None, pose.identity())
-    viewer.close(stream)
+    rerun_streams.close(stream)
     printed(tmp_path / "objects.rrd", "verify")
     text = printed(tmp_path / "objects.rrd", "print", "-vvv")
     assert "/world/source/objects " in text and "id 3: 6.0 m/s" in text and "Boxes3D" in text
@@ -129,7 +126,7 @@ def test_a_scan_without_any_motion_or_match_or_crispness_can_be_logged(tmp_path)
                     match_target=np.empty((0, 3)))
     stream = viewer.open_recording(tmp_path / "still.rrd")
     viewer.log_pair(stream, 0, pair, still, None, pose.identity(), arrows=True)
-    viewer.close(stream)
+    rerun_streams.close(stream)
     text = printed(tmp_path / "still.rrd", "print", "-v")
     assert f" /{viewer.STATIC} " in text and "Scalars" not in text
 
@@ -140,9 +137,9 @@ def test_times_are_dates_where_they_count_from_1970(tmp_path, start_ns, is_date)
     pair = ScanPair(replace(pair.source, time_ns=start_ns), replace(pair.target, time_ns=start_ns + 10**8))
     stream = viewer.open_recording(tmp_path / "timed.rrd")
     viewer.log_pair(stream, 0, pair, result, None, pose.identity())
-    viewer.close(stream)
+    rerun_streams.close(stream)
     text = printed(tmp_path / "timed.rrd", "print", "-vvv")
-    assert f"index_name: {viewer.TIME} " in text
+    assert f"index_name: {rerun_streams.TIME} " in text
     assert ("Duration(ns)" in text) != is_date
 
 
@@ -158,7 +155,7 @@ def test_stored_arrays_get_the_same_look_with_or_without_the_next_scan(tmp_path)
     for name, target_points in (("with.rrd", pair.target.points), ("without.rrd", None)):
         stream = viewer.open_recording(tmp_path / name)
         viewer.log_flow(stream, *arrays, target_points=target_points)
-        viewer.close(stream)
+        rerun_streams.close(stream)
         text = printed(tmp_path / name, "print", "-v")
         assert f" /{viewer.MOVING} " in text and f" /{viewer.MOVED} " in text
         assert (f" /{viewer.NEXT} " in text) == (target_points is not None)
@@ -169,69 +166,5 @@ def test_a_recording_of_a_full_scan_stays_small(tmp_path):
     pair, result = next(drive(points_n=120_000))
     stream = viewer.open_recording(path)
     viewer.log_pair(stream, 0, pair, result, None, pose.identity())
-    viewer.close(stream)
+    rerun_streams.close(stream)
     assert path.stat().st_size < 8e6
-
-
-def test_no_display_is_one_clear_line(tmp_path, monkeypatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(viewer.sys, "platform", "linux")
-    monkeypatch.setattr(viewer, "_viewer_listens", lambda: False)
-    path = tmp_path / "empty.rrd"
-    path.touch()
-    for attempt in (lambda: viewer.open_in_viewer(path), lambda: viewer.open_recording(None, spawn=True)):
-        with pytest.raises(InstallError, match="display") as caught:
-            attempt()
-        assert "\n" not in str(caught.value)
-
-
-def test_paths_that_cannot_be_used_are_data_errors(tmp_path):
-    with pytest.raises(DataError, match=r"nowhere"):
-        viewer.open_recording(tmp_path / "nowhere" / "recording.rrd")
-    with pytest.raises(DataError, match="no such recording"):
-        viewer.open_in_viewer(tmp_path / "absent.rrd")
-    with pytest.raises(ValueError, match="path"):
-        viewer.open_recording(None)
-
-
-class Ended:
-    """A stream whose writer has ended, as when the disk is full; it says so once more when it is let go."""
-
-    def flush(self, timeout_sec):
-        raise RuntimeError("writer ended")
-
-    def disconnect(self):
-        os.write(2, b"writer ended\n")
-
-
-def test_a_recording_that_cannot_be_ended_is_one_error(capfd):
-    with pytest.raises(OSError, match="is the disk full"):
-        viewer.close(Ended())
-    assert capfd.readouterr().err == ""
-
-
-class Silent:
-    """A stream whose writer does not answer any more; ending it would wait for ever."""
-
-    def __init__(self, path, grows):
-        self.path, self.grows = path, grows
-
-    def flush(self, timeout_sec):
-        time.sleep(timeout_sec)
-        if self.grows:
-            self.grows -= 1
-            with self.path.open("ab") as file:
-                file.write(b"more")
-        raise RuntimeError("timed out")
-
-
-@pytest.mark.parametrize("grows", [0, 2])
-def test_a_recording_that_grows_no_more_is_given_up(tmp_path, monkeypatch, grows):
-    monkeypatch.setattr(viewer, "_STALLED_S", 0.05)
-    monkeypatch.setattr(viewer, "stalled", [])
-    (tmp_path / "a.rrd").touch()
-    stream = Silent(tmp_path / "a.rrd", grows)
-    with pytest.raises(TimeoutError, match="is the disk full"):
-        viewer.close(stream, tmp_path / "a.rrd")
-    assert viewer.stalled == [stream] and stream.grows == 0
