@@ -121,7 +121,7 @@ def pair(
     overrides: Overrides = None,
 ) -> None:
     """Flow between two clouds; nothing else is needed."""
-    from lidarflow import datasets, io, methods, metrics, preview
+    from lidarflow import datasets, flow_files, io, methods, metrics, preview
     from lidarflow.config import load
     from lidarflow.types import ScanPair
 
@@ -143,7 +143,7 @@ def pair(
                 preview.write_preview(aside, scans, result)
         if recording is not None or visualize:
             _record_pair(recording, visualize, arrows, scans, result, alignment)
-        io.save_flow(out, scans.source.points, result, settings)
+        flow_files.save_flow(out, scans.source.points, result, settings)
     from lidarflow.tables import pair_table
 
     _print(pair_table(scans, result, alignment))
@@ -262,7 +262,7 @@ def view(
     import shutil
     import tempfile
 
-    from lidarflow import io, rerun_streams, rgbd_io, run_folder
+    from lidarflow import flow_files, io, rerun_streams, rgbd_io, run_folder
 
     _check_exists(what, "a run folder, a recording (.rrd) or a flow file (.npz)")
     if save is not None:
@@ -282,7 +282,7 @@ def view(
         _record_flow_file(what, target, save)
         print(f"recording  {save}")
     else:
-        rgbd_io.load_flow(what) if rgbd_io.is_rgbd_flow(what) else io.load_flow(what)
+        rgbd_io.load_flow(what) if rgbd_io.is_rgbd_flow(what) else flow_files.load_flow(what)
         rerun_streams.require_display(f"make a recording with: lidarflow view {what} --save FILE.rrd")
         with tempfile.TemporaryDirectory() as folder:
             recording = Path(folder) / "flow.rrd"
@@ -342,12 +342,12 @@ def _record_pair(recording, visualize, arrows, scans, result, alignment) -> None
 
 
 def _record_flow_file(file: Path, target: Path | None, recording: Path) -> None:
-    from lidarflow import datasets, io, rerun_streams, rgbd_io, viewer
+    from lidarflow import datasets, flow_files, io, rerun_streams, rgbd_io, viewer
 
     if rgbd_io.is_rgbd_flow(file):
         _record_rgbd_file(file, target, recording)
         return
-    found = io.load_flow(file)
+    found = flow_files.load_flow(file)
     correction = found.config.get("preparation", {}).get("kitti_correction", "auto")
     points = None if target is None else datasets.read_scan(target, correction).points
     with io.written_aside(recording) as aside:

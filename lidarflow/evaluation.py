@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, metrics, pair_reports, provenance
+from lidarflow import flow_files, io, metrics, pair_reports, provenance
 from lidarflow.config import Config, load, updated
 from lidarflow.datasets import Dataset, Source
 from lidarflow.datasets.base import read_truth
@@ -85,7 +85,7 @@ def evaluate_file(file: Path, truth: Path | None) -> Evaluation:
 
     Raises DataError for files that cannot be read, of different length, or without truth.
     """
-    config = updated(Config(), io.load_flow(file).config, str(file))
+    config = updated(Config(), flow_files.load_flow(file).config, str(file))
     if truth is None:
         raise DataError(f"{file}: a flow file alone has no truth; give --truth FILE.npz, "
                         "or evaluate the folder of its run")
@@ -108,7 +108,7 @@ def known_pairs(run_dir: Path, numbers: Sequence[int]) -> Iterator[tuple[ScanPai
         index, following = source.pairs[number]
         pair = ScanPair(dataset.scan(index), dataset.scan(following))
         file = run_dir / io.FLOW_FOLDER / f"{pair.source.name}.npz"
-        _check_points(file, io.load_flow(file).points, pair.source, dataset)
+        _check_points(file, flow_files.load_flow(file).points, pair.source, dataset)
         yield pair, pair_reports.find_truth(dataset, index, pair)[0]
 
 
@@ -199,14 +199,14 @@ def _from_files(
     unknown = metrics.Alignment(_UNKNOWN, _UNKNOWN, _UNKNOWN, config.crispness.sigma_m)
     alignment = recorded or unknown
     if following is not None:
-        target = Scan(io.load_flow(following).points, name=following.stem)
+        target = Scan(flow_files.load_flow(following).points, name=following.stem)
         alignment = metrics.alignment(source, target, result, config.crispness.sigma_m)
     return pair_reports.report_result(source, result, None, alignment, known, known.origin)
 
 
 def _read(file: Path) -> tuple[np.ndarray, FlowResult]:
     """The source cloud's points (N, 3) and the answer in a flow file."""
-    found = io.load_flow(file)
+    found = flow_files.load_flow(file)
     try:
         return found.points, found.result()
     except (TypeError, ValueError) as error:

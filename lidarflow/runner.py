@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidarflow import io, methods, pose, preview, provenance, resuming, run_folder
+from lidarflow import flow_files, io, methods, pose, preview, provenance, resuming, run_folder
 from lidarflow.aside import Aside, ahead, there
 from lidarflow.checkpoints import CheckpointFiles, Checkpoints
 from lidarflow.config import Config
@@ -187,7 +187,7 @@ def _write_pair(
     file = out / io.FLOW_FOLDER / f"{pair.source.name}.npz"
     with Aside() as beside:
         saved = there(None) if step.is_written(file) else beside.begin(
-            io.save_flow, file, pair.source.points, result, config)
+            flow_files.save_flow, file, pair.source.points, result, config)
         report = report_pair(dataset, step.index, pair, result, config)
         saved.result()
     world_from_source = way.add(step.index, pair, result.ego_motion)

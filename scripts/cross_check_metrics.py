@@ -35,7 +35,7 @@ from bucketed_scene_flow_eval.datastructures import (
 from bucketed_scene_flow_eval.eval.bucketed_epe import BucketedEPEEvaluator
 from evaluate import table
 
-from lidarflow import io, metrics, pose, provenance
+from lidarflow import flow_files, io, metrics, pose, provenance
 from lidarflow.datasets import argoverse2_map, open_dataset
 from lidarflow.metrics.bucketed import CLASSES
 from lidarflow.types import Category, FlowResult, SolveStats, Truth
@@ -78,7 +78,7 @@ def pairs_of_run(run_dir: Path) -> Iterable[Pair]:
         scan, truth = dataset.scan(index), dataset.truth(index)
         if truth is None or truth.category is None:
             raise SystemExit(f"{run_dir}: no flow with classes is known of scan {scan.name}")
-        yield scan.points, io.load_flow(run_dir / io.FLOW_FOLDER / f"{scan.name}.npz").result(), truth
+        yield scan.points, flow_files.load_flow(run_dir / io.FLOW_FOLDER / f"{scan.name}.npz").result(), truth
 
 
 def known_rows(result: FlowResult, truth: Truth) -> np.ndarray:

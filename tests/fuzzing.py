@@ -22,7 +22,7 @@ import numpy as np
 from cloud_files import POINTS, WRITERS
 from PIL import Image
 
-from lidarflow import config, evaluation, io, pose, provenance, rgbd_io
+from lidarflow import config, evaluation, flow_files, io, pose, provenance, rgbd_io
 from lidarflow.checkpoints import Stretch, packed, unpacked
 from lidarflow.config import Config
 from lidarflow.datasets import (
@@ -121,7 +121,7 @@ def _renamed(file, name):
 
 def _add_archives(add, pair, result, tracks):
     points = pair.source.points
-    add("flow.npz", lambda file: io.save_flow(file, points, result, Config()),
+    add("flow.npz", lambda file: flow_files.save_flow(file, points, result, Config()),
         evaluation._read)
     add("checkpoint.npz", lambda file: file.write_bytes(packed(pair, result, tracks, Stretch(0, 0))),
         lambda file: unpacked(file, pair))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidarflow import io, pose, provenance
+from lidarflow import flow_files, io, pose, provenance
 from lidarflow.config import load
 from lidarflow.types import FlowResult, SolveStats
 
@@ -20,7 +20,7 @@ def write_run(run_dir, dataset, scans):
     for index in scans[:-1]:
         scan = dataset.scan(index)
         result = answer(scan, dataset.truth(index))
-        io.save_flow(run_dir / "flow" / f"{scan.name}.npz", scan.points, result, CONFIG)
+        flow_files.save_flow(run_dir / "flow" / f"{scan.name}.npz", scan.points, result, CONFIG)
         world_from_sensor.append(world_from_sensor[-1] @ pose.inverse(result.ego_motion))
     times_ns = [dataset.scan(index).time_ns for index in scans]
     io.write_poses_tum(run_dir / "poses_tum.txt", np.stack(world_from_sensor), times_ns)
@@ -29,7 +29,7 @@ def write_run(run_dir, dataset, scans):
 
 def flows(run_dir):
     """What the flow files of a run hold, in order."""
-    return [io.load_flow(file) for file in sorted((run_dir / "flow").iterdir())]
+    return [flow_files.load_flow(file) for file in sorted((run_dir / "flow").iterdir())]
 
 
 def answer(scan, truth):

@@ -8,7 +8,7 @@ import pytest
 from cloud_files import write_bin
 from command_line import drive, rests
 
-from lidarflow import io, synthetic
+from lidarflow import flow_files, synthetic
 
 pytestmark = pytest.mark.usefixtures("in_tmp_path")
 
@@ -85,7 +85,7 @@ def test_a_damaged_scan_in_the_middle_keeps_what_was_done(lidarflow, folder, tmp
     assert sorted(os.listdir(tmp_path / "out")) == [
         ".resume", "config.toml", "flow", "source.json"]
     assert os.listdir(tmp_path / "out" / "flow") == ["000000.npz"]
-    assert len(io.load_flow(tmp_path / "out" / "flow" / "000000.npz").flow) == len(drive()[0][0])
+    assert len(flow_files.load_flow(tmp_path / "out" / "flow" / "000000.npz").flow) == len(drive()[0][0])
     assert "cut short" in lidarflow.complaint("view", "out")
 
 
@@ -132,7 +132,7 @@ def test_clouds_that_are_no_files(lidarflow, folder):
 
 def valid_result(file, points):
     """The flow file, checked for what any valid result obeys."""
-    found = io.load_flow(file)
+    found = flow_files.load_flow(file)
     finite = np.isfinite(points).all(axis=1)
     assert len(found.flow) == len(points)
     assert np.isfinite(found.flow[finite]).all() and np.isnan(found.flow[~finite]).all()

@@ -18,6 +18,7 @@ from lidarflow import (
     config,
     datasets,
     demo,
+    flow_files,
     io,
     metrics,
     pair_reports,
@@ -151,7 +152,7 @@ def test_what_has_no_effect_is_said(lidarflow, scans, tmp_path):
 
 def test_pair_finds_the_ego_motion(lidarflow, scans, tmp_path):
     lidarflow.ok("pair", *scans[:2], "--out", tmp_path / "flow.npz", *OFF)
-    found, truth = io.load_flow(tmp_path / "flow.npz"), drive()[0][1]
+    found, truth = flow_files.load_flow(tmp_path / "flow.npz"), drive()[0][1]
     assert pose.translation_distance(found.ego_motion[None], truth.ego_motion[None])[0] < 0.03
 
 
@@ -187,7 +188,7 @@ def test_a_run_folder_holds_the_contract(finished):
     assert sorted(os.listdir(out / "flow")) == ["000000.npz", "000001.npz"]
     assert not rests(out.parent)
     for k in (0, 1):
-        found = io.load_flow(out / "flow" / f"00000{k}.npz")
+        found = flow_files.load_flow(out / "flow" / f"00000{k}.npz")
         assert len(found.flow) == len(drive()[k][0])
         assert found.config["preparation"]["kitti_correction"] == "off"
     assert config.load(out / "config.toml") == config.load(overrides=OFF[1:])
@@ -215,7 +216,7 @@ def test_objects_of_a_run_are_boxes_around_their_points_that_move_as_they_do(fin
     header, *rows = (out / "objects.csv").read_text().splitlines()
     assert header == "frame,id,points,x,y,z,length,width,height,yaw,vx,vy,vz,speed_m_per_s"
     for k, frame in enumerate(("000000", "000001")):
-        found, truth = io.load_flow(out / "flow" / f"{frame}.npz"), drive()[k][1]
+        found, truth = flow_files.load_flow(out / "flow" / f"{frame}.npz"), drive()[k][1]
         over_ground = metres_over_ground(found.points, found.flow, found.ego_motion)
         true_over_ground = metres_over_ground(drive()[k][0].points, truth.flow, truth.ego_motion)
         of_frame = np.array([line.split(",")[1:] for line in rows if line.split(",")[0] == frame], float)
@@ -246,7 +247,7 @@ def test_a_run_without_objects_says_so(lidarflow, scans, tmp_path):
     lidarflow.ok("run", scans[0].parent, "-n", 2, "--set", "objects.enabled=false", "--out",
                  tmp_path / "out", "--no-record")
     assert (tmp_path / "out" / "objects.csv").read_text().count("\n") == 1
-    assert (io.load_flow(tmp_path / "out" / "flow" / "000000.npz").object_id == -1).all()
+    assert (flow_files.load_flow(tmp_path / "out" / "flow" / "000000.npz").object_id == -1).all()
 
 
 def test_metrics_of_a_run_are_scores_against_the_truth(finished):
@@ -476,14 +477,14 @@ def test_a_signal_is_one_line_and_leaves_only_whole_files(scans, tmp_path, sent,
                    "--resume goes on\n")
     assert not rests(tmp_path)
     for file in (tmp_path / "out" / "flow").iterdir():
-        io.load_flow(file)
+        flow_files.load_flow(file)
     assert all(io.is_whole(file) for file in tmp_path.rglob("*.npz"))
 
 
 def test_solver_is_short_for_its_setting(lidarflow, scans, tmp_path):
     for name in ("gtsam", "fast"):
         lidarflow.ok("pair", *scans[:2], "--out", tmp_path / f"{name}.npz", "--solver", name)
-        assert io.load_flow(tmp_path / f"{name}.npz").config["solver"]["method"] == name
+        assert flow_files.load_flow(tmp_path / f"{name}.npz").config["solver"]["method"] == name
     told = lidarflow.complaint("pair", *scans[:2], "--out", tmp_path / "no.npz", "--solver", "slow")
     assert told.startswith("--solver: solver.method: expected one of fast, gtsam, got 'slow'")
     assert "solver.method" in lidarflow.ok("config")

@@ -16,7 +16,7 @@ from killed import contents, program
 
 pytest.importorskip("distributed", reason="Dask distributed is not installed: pip install 'lidarflow[dask]'")
 
-from lidarflow import cluster, io
+from lidarflow import cluster, flow_files, io
 from lidarflow.checkpoints import Checkpoints, Numbers, numbers_of, packed, renumbered
 from lidarflow.cluster import WARM_UP_PAIRS, WARM_UP_SCANS, Chunk
 from lidarflow.config import Config, EgoConfig
@@ -239,7 +239,7 @@ def test_chunks_differ_little_where_the_warm_up_does_not_reach_the_start(tmp_pat
         kept.put(index, content)
     for index in range(chunk.start, chunk.stop):
         pair = ScanPair(dataset.scan(index), dataset.scan(index + 1))
-        one_go = io.load_flow(tmp_path / "run" / "flow" / f"{pair.source.name}.npz")
+        one_go = flow_files.load_flow(tmp_path / "run" / "flow" / f"{pair.source.name}.npz")
         result, _ = kept.load(index, pair)
         assert np.nanquantile(np.linalg.norm(one_go.flow - result.flow, axis=1), 0.9) < 1e-3
         assert (one_go.is_dynamic != result.is_dynamic).mean() < 0.02

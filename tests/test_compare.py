@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from command_line import drive, rests
 
-from lidarflow import cli, compare, config, io, methods, pose, tables
+from lidarflow import cli, compare, config, flow_files, methods, pose, tables
 from lidarflow.config import Config
 from lidarflow.datasets import open_dataset
 from lidarflow.errors import ConfigError, DataError
@@ -26,7 +26,7 @@ def test_pair_by_any_method(lidarflow, scans, tmp_path, name):
     out = lidarflow.ok("pair", *scans[:2], "--method", name, "--out", tmp_path / "f.npz", *OFF,
                        "--recording", tmp_path / "f.rrd", "--picture", tmp_path / "f.png")
     assert f"method     {name}\n" in out and "found a match" not in out
-    found = io.load_flow(tmp_path / "f.npz")
+    found = flow_files.load_flow(tmp_path / "f.npz")
     assert found.stats["solver"] == name and len(found.flow) == len(drive()[0][0])
     known = drive()[0][1].ego_motion
     assert (pose.translation_distance(found.ego_motion, known) < 0.05) == (name != "zero")

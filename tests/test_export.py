@@ -10,7 +10,7 @@ from argoverse_log import TIMES, write_log
 from command_line import drive, rests
 from run_folders import STATS, flows, write_run
 
-from lidarflow import colour, config, export, io, pose, provenance, synthetic
+from lidarflow import colour, config, export, flow_files, pose, provenance, synthetic
 from lidarflow.datasets import open_dataset, read_points
 from lidarflow.datasets.argoverse2 import read_columns
 from lidarflow.types import FlowResult
@@ -39,9 +39,10 @@ def log_run(tmp_path):
 
 
 def make_unknown(file):
-    found = io.load_flow(file)
+    found = flow_files.load_flow(file)
     found.points[0] = found.flow[0] = np.nan
-    io.save_flow(file, found.points, found.result(), config.updated(config.Config(), found.config, str(file)))
+    settings = config.updated(config.Config(), found.config, str(file))
+    flow_files.save_flow(file, found.points, found.result(), settings)
 
 
 def table(file):
@@ -292,7 +293,7 @@ def test_many_objects_fit_into_the_numbers_of_opensceneflow(tmp_path):
     numbers = np.array([-1, 0, 40_000], np.int32)
     flow = np.zeros((3, 3))
     yes = np.ones(3, bool)
-    io.save_flow(tmp_path / "f.npz", flow, FlowResult(
+    flow_files.save_flow(tmp_path / "f.npz", flow, FlowResult(
         flow, pose.identity(3), yes, yes, yes, np.eye(4), STATS, object_id=numbers), config.Config())
-    ids = opensceneflow._pair_arrays(io.load_flow(tmp_path / "f.npz"))["flow_instance_id"]
+    ids = opensceneflow._pair_arrays(flow_files.load_flow(tmp_path / "f.npz"))["flow_instance_id"]
     assert ids.tolist() == [0, 1, 32767]

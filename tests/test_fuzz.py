@@ -11,7 +11,7 @@ import pytest
 from cloud_files import message
 from shared_data import ROOT, with_paths
 
-from lidarflow import io
+from lidarflow import flow_files
 from lidarflow.datasets import argoverse2_map
 from lidarflow.datasets.base import read_truth
 from lidarflow.datasets.clouds import load_arrays, read_points
@@ -50,14 +50,15 @@ class Bomb:
 
 
 @pytest.mark.parametrize("name, read", [
-    ("a.npz", read_points), ("a.npy", read_points), ("a.npz", io.load_flow), ("a.npz", load_arrays),
+    ("a.npz", read_points), ("a.npy", read_points), ("a.npz", flow_files.load_flow), ("a.npz", load_arrays),
     ("a.npz", lambda file: read_truth(file, 1, "0")), ("a.npy", argoverse2_map._read_raster)])
 def test_no_pickle_is_ever_loaded(tmp_path, name, read):
     mark = tmp_path / "unpickled"
     bomb = np.array([Bomb(mark)], object)
     with (tmp_path / name).open("wb") as file:
         if name.endswith(".npz"):
-            keys = ("points", *io._ROW_ARRAYS, *io._WHOLE_ARRAYS, "dynamic", "track", "target_from_source")
+            keys = ("points", *flow_files._ROW_ARRAYS, *flow_files._WHOLE_ARRAYS, "dynamic", "track",
+                    "target_from_source")
             np.savez(file, **dict.fromkeys(keys, bomb))
         else:
             np.save(file, bomb, allow_pickle=True)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from cloud_files import write_bin
 
-from lidarflow import export, io, pose, provenance, synthetic
+from lidarflow import export, flow_files, pose, provenance, synthetic
 from lidarflow.config import Config, EgoConfig
 from lidarflow.datasets import open_dataset
 from lidarflow.datasets.argoverse2 import read_columns
@@ -68,7 +68,7 @@ def test_the_sensor_goes_on_over_a_gap_for_as_long_as_its_times_say():
 
 def motions(run_dir):
     """The ego-motions of the run's pairs."""
-    return [io.load_flow(run_dir / "flow" / f"{name}.npz").ego_motion for name in NAMES]
+    return [flow_files.load_flow(run_dir / "flow" / f"{name}.npz").ego_motion for name in NAMES]
 
 
 def test_every_pair_has_its_cloud(run, tmp_path):
@@ -81,7 +81,7 @@ def test_argoverse_files_are_called_by_the_times_of_their_scans(run, tmp_path):
     files = list(export.export(run[0], "av2-v1", tmp_path / "av2"))
     assert [file.stem for file in files] == [str(index * NS) for index in (0, 3, 4)]
     for file, name in zip(files, NAMES, strict=True):
-        found = io.load_flow(run[0] / "flow" / f"{name}.npz")
+        found = flow_files.load_flow(run[0] / "flow" / f"{name}.npz")
         np.testing.assert_array_equal(
             read_columns(file, ("flow_tx_m",))["flow_tx_m"], found.flow[:, 0].astype(np.float16))
 

@@ -11,7 +11,7 @@ import pytest
 from cloud_files import message
 
 from lidarflow import config as settings
-from lidarflow import io, pose, run_folder
+from lidarflow import flow_files, io, pose, run_folder
 from lidarflow.config import Config
 from lidarflow.types import FlowResult, SolveStats
 
@@ -42,7 +42,7 @@ def some_result(seconds=1.0):
 @pytest.fixture
 def saved(tmp_path):
     points, result = some_result()
-    io.save_flow(tmp_path / "flow.npz", points, result, Config())
+    flow_files.save_flow(tmp_path / "flow.npz", points, result, Config())
     return tmp_path / "flow.npz"
 
 
@@ -57,7 +57,7 @@ def change(file, **changes):
 
 def test_a_flow_file_comes_back(saved):
     points, result = some_result()
-    loaded = io.load_flow(saved)
+    loaded = flow_files.load_flow(saved)
     np.testing.assert_allclose(loaded.points, points, rtol=1e-6)
     np.testing.assert_allclose(loaded.flow, result.flow, rtol=1e-5)
     np.testing.assert_allclose(loaded.motions, result.motions, atol=1e-5)
@@ -85,15 +85,15 @@ def test_a_flow_file_is_the_stable_contract(saved):
 
 def test_points_are_on_no_object_where_none_are_given(tmp_path):
     points, result = some_result()
-    io.save_flow(tmp_path / "a.npz", points, replace(result, object_id=None), Config())
-    assert (io.load_flow(tmp_path / "a.npz").object_id == -1).all()
+    flow_files.save_flow(tmp_path / "a.npz", points, replace(result, object_id=None), Config())
+    assert (flow_files.load_flow(tmp_path / "a.npz").object_id == -1).all()
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path, monkeypatch):
     for name, years, seconds in (("a.npz", 0, 1.0), ("b.npz", 3, 9.0)):
         now = time.localtime(1.7e9 + years * 3.2e7)
         monkeypatch.setattr(time, "localtime", lambda *_, now=now: now)
-        io.save_flow(tmp_path / name, *some_result(seconds=seconds), Config())
+        flow_files.save_flow(tmp_path / name, *some_result(seconds=seconds), Config())
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     with zipfile.ZipFile(tmp_path / "a.npz") as archive:
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
@@ -102,15 +102,15 @@ def test_the_same_input_gives_the_same_bytes(tmp_path, monkeypatch):
 def test_motions_that_are_nan_stay_nan(tmp_path):
     points, result = some_result()
     result.motions[1] = np.nan
-    io.save_flow(tmp_path / "a.npz", points, result, Config())
-    motions = io.load_flow(tmp_path / "a.npz").motions
+    flow_files.save_flow(tmp_path / "a.npz", points, result, Config())
+    motions = flow_files.load_flow(tmp_path / "a.npz").motions
     assert np.isnan(motions[1]).all() and pose.is_rigid(motions[[0, 2, 3, 4]], 1e-6)
 
 
 def test_points_and_result_must_match(tmp_path):
     points, result = some_result()
     with pytest.raises(ValueError, match="do not match"):
-        io.save_flow(tmp_path / "a.npz", points[:3], result, Config())
+        flow_files.save_flow(tmp_path / "a.npz", points[:3], result, Config())
     assert not list(tmp_path.iterdir())
 
 
@@ -129,26 +129,26 @@ def test_points_and_result_must_match(tmp_path):
 ])
 def test_a_flow_file_with_wrong_content(saved, changes, found):
     change(saved, **changes)
-    assert found in message(io.load_flow, saved)
+    assert found in message(flow_files.load_flow, saved)
 
 
 def test_what_is_not_a_flow_file(tmp_path, saved):
-    assert "no such file" in message(io.load_flow, tmp_path / "none.npz")
-    assert "is a folder" in message(io.load_flow, tmp_path)
+    assert "no such file" in message(flow_files.load_flow, tmp_path / "none.npz")
+    assert "is a folder" in message(flow_files.load_flow, tmp_path)
     (tmp_path / "text.npz").write_text("hello")
-    assert "not an .npz archive" in message(io.load_flow, tmp_path / "text.npz")
+    assert "not an .npz archive" in message(flow_files.load_flow, tmp_path / "text.npz")
     np.save(tmp_path / "array.npy", np.zeros(3))
-    assert "not an .npz archive" in message(io.load_flow, tmp_path / "array.npy")
+    assert "not an .npz archive" in message(flow_files.load_flow, tmp_path / "array.npy")
     content = saved.read_bytes()
     saved.write_bytes(content[:len(content) // 2])
-    assert "truncated" in message(io.load_flow, saved)
+    assert "truncated" in message(flow_files.load_flow, saved)
     saved.write_bytes(content[:200] + bytes(50) + content[250:])
-    assert "not a readable flow file" in message(io.load_flow, saved)
+    assert "not a readable flow file" in message(flow_files.load_flow, saved)
 
 
 def test_pickles_are_never_loaded(saved):
     change(saved, config=np.array([{"a": 1}], dtype=object))
-    assert "not a readable flow file" in message(io.load_flow, saved)
+    assert "not a readable flow file" in message(flow_files.load_flow, saved)
 
 
 # --- poses, settings, JSON ---

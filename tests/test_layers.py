@@ -20,7 +20,7 @@ LAYERS = [
     {"pipeline", "rgbd_methods"},
     {"methods", "rerun_streams"},
     {"metrics", "rgbd_metrics", "io", "viewer", "preview", "rgbd_preview"},
-    {"pair_reports", "provenance", "rgbd_io", "checkpoints", "trajectory", "run_folder"},
+    {"flow_files", "pair_reports", "provenance", "rgbd_io", "checkpoints", "trajectory", "run_folder"},
     {"rgbd_viewer", "rgbd_checkpoints", "resuming", "stepping"},
     {"runner", "cluster"},
     {"rgbd_runner"},

@@ -16,7 +16,17 @@ from PIL import Image
 from run_folders import CONFIG, OFF_M, write_run
 from test_preview import MOVER, street
 
-from lidarflow import evaluation, io, metrics, pair_reports, preview, provenance, report, synthetic
+from lidarflow import (
+    evaluation,
+    flow_files,
+    io,
+    metrics,
+    pair_reports,
+    preview,
+    provenance,
+    report,
+    synthetic,
+)
 from lidarflow.datasets import open_dataset
 from lidarflow.pair_reports import PairReport
 from lidarflow.report import pictures, plots, reading
@@ -223,7 +233,7 @@ def test_a_run_without_truth(lidarflow, tmp_path):
 def without_truth(scans, run):
     reports = []
     for scan, following in itertools.pairwise(scans):
-        found = io.load_flow(run / "flow" / f"{scan.name}.npz").result()
+        found = flow_files.load_flow(run / "flow" / f"{scan.name}.npz").result()
         aligned = metrics.alignment(scan, following, found, CONFIG.crispness.sigma_m)
         reports.append(pair_reports.report_result(scan, found, 5, aligned, None, "none"))
     return pair_reports.metrics_of(reports, CONFIG)

@@ -14,7 +14,7 @@ from cloud_files import message
 from command_line import street_folder
 from killed import contents, program, was_killed
 
-from lidarflow import io, pose
+from lidarflow import flow_files, io, pose
 from lidarflow.checkpoints import Checkpoints, packed
 from lidarflow.config import Config
 from lidarflow.datasets import open_dataset
@@ -283,7 +283,7 @@ def test_the_pair_after_a_gap_is_that_of_a_run_that_begins_there(damaged, street
     process(open_dataset(damaged), list(range(SCANS)), Config(), tmp_path / "gap", QUIET,
             going=Going(skip_bad=True))
     process(open_dataset(street), [3, 4], Config(), tmp_path / "fresh", QUIET)
-    gap, fresh = (io.load_flow(tmp_path / name / "flow" / "000003.npz") for name in ("gap", "fresh"))
+    gap, fresh = (flow_files.load_flow(tmp_path / name / "flow" / "000003.npz") for name in ("gap", "fresh"))
     np.testing.assert_array_equal(gap.flow, fresh.flow)
     np.testing.assert_array_equal(gap.object_id >= 0, fresh.object_id >= 0)
 

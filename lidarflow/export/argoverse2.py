@@ -17,7 +17,8 @@ import numpy as np
 from lidarflow.errors import DataError, InstallError
 from lidarflow.export.argoverse2_masks import Masks
 from lidarflow.export.finished_run import FinishedRun, scene_name
-from lidarflow.io import FlowFile, written_aside
+from lidarflow.flow_files import FlowFile
+from lidarflow.io import written_aside
 
 COLUMNS = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, pose, provenance, rgbd_io
+from lidarflow import flow_files, io, pose, provenance, rgbd_io
 from lidarflow.config import Config, load
 from lidarflow.datasets import Dataset, tum
 from lidarflow.datasets.argoverse2 import Argoverse2
@@ -61,7 +61,7 @@ class FinishedRun:
         number_of = {index: number for number, index in enumerate(self.scans)}
         return [number_of[index] for index, _ in self.source.pairs]
 
-    def pairs(self) -> Iterator[tuple[int, str, io.FlowFile]]:
+    def pairs(self) -> Iterator[tuple[int, str, flow_files.FlowFile]]:
         """Number and name of the source scan, and flow, of every pair; DataError where one is missing."""
         sources = self.sources()
         files = natural_sorted((self.folder / io.FLOW_FOLDER).glob("*.npz"))
@@ -70,7 +70,7 @@ class FinishedRun:
         for number, file in zip(sources, files, strict=True):
             if rgbd_io.is_rgbd_flow(file):
                 raise DataError(f"{self.folder}: is a run of RGB-D images; of those, only poses are exported")
-            yield number, file.stem, io.load_flow(file)
+            yield number, file.stem, flow_files.load_flow(file)
 
     def dt_s(self, number: int) -> float:
         """Seconds from the source scan of a pair to its target."""

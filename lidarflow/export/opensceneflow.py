@@ -16,7 +16,8 @@ import numpy as np
 from lidarflow.datasets.clouds import natural_sorted, one_line
 from lidarflow.errors import DataError, InstallError
 from lidarflow.export.finished_run import FinishedRun, scene_name
-from lidarflow.io import FlowFile, written_aside
+from lidarflow.flow_files import FlowFile
+from lidarflow.io import written_aside
 from lidarflow.lidar import features
 from lidarflow.types import Scan
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from lidarflow import colour, pose
 from lidarflow.export.finished_run import FinishedRun
-from lidarflow.io import FlowFile, written_aside
+from lidarflow.flow_files import FlowFile
+from lidarflow.io import written_aside
 
 _VERTEX = np.dtype([
     *((axis, "<f4") for axis in "xyz"), *((channel, "u1") for channel in ("red", "green", "blue")),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import evaluation, io, metrics, provenance
+from lidarflow import evaluation, flow_files, io, metrics, provenance
 from lidarflow.config import Config, load
 from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.errors import DataError, LidarflowError
@@ -199,7 +199,7 @@ def _object(number: int, rows: list[dict[str, str]]) -> SeenObject:
 
 def _picture(file: Path, frame: str, pair: ScanPair | None, truth: Truth | None) -> Picture:
     """The pictures of a flow file; `pair` is None where the scans are not at hand."""
-    found = io.load_flow(file)
+    found = flow_files.load_flow(file)
     try:
         result = found.result()
     except (TypeError, ValueError) as error:
