@@ -321,7 +321,8 @@ def show_config() -> None:
 
 def _with_solver(overrides: list[str] | None, solver: str | None) -> tuple[str, ...]:
     """The overrides of settings, and the one that --solver stands for."""
-    from lidarflow.config import Config, updated
+    from lidarflow.config import Config
+    from lidarflow.settings import updated
 
     if solver is not None:
         updated(Config(), {"solver": {"method": solver}}, "--solver")     # names the option that was given

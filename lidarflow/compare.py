@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lidarflow import methods, metrics, pair_reports
-from lidarflow.config import Config, to_dict
+from lidarflow.config import Config
 from lidarflow.datasets import Dataset
 from lidarflow.errors import ConfigError, LidarflowError
 from lidarflow.lidar import features
+from lidarflow.settings import to_dict
 from lidarflow.types import FlowResult, ScanPair, Truth
 
 

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow import flow_files, io, metrics, pair_reports, provenance
-from lidarflow.config import Config, load, updated
+from lidarflow.config import Config, load
 from lidarflow.datasets import Dataset, Source
 from lidarflow.datasets.base import read_truth
 from lidarflow.datasets.clouds import natural_sorted
 from lidarflow.errors import DataError
 from lidarflow.pair_reports import PairReport
 from lidarflow.provenance import RunSource
+from lidarflow.settings import updated
 from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
 _UNKNOWN = float("nan")

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from lidarflow import io, pose
-from lidarflow.config import Config, to_dict
+from lidarflow.config import Config
 from lidarflow.errors import DataError
+from lidarflow.settings import to_dict
 from lidarflow.types import FlowResult, SolveStats
 
 # name: (shape, after N for the arrays with a row per point; dtype kind)

@@ -18,10 +18,11 @@ import numpy as np
 import tomli_w
 
 from lidarflow import pose
-from lidarflow.config import Config, to_dict
+from lidarflow.config import Config
 from lidarflow.datasets import arrays
 from lidarflow.errors import DataError
 from lidarflow.rgbd_config import RgbdConfig
+from lidarflow.settings import to_dict
 
 FLOW_FOLDER = "flow"
 CONFIG_FILE = "config.toml"

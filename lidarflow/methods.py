@@ -4,9 +4,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from lidarflow import baselines, pipeline
-from lidarflow.config import Config, to_dict
+from lidarflow.config import Config
 from lidarflow.errors import ConfigError
 from lidarflow.pipeline import Estimator
+from lidarflow.settings import to_dict
 from lidarflow.types import FlowResult, ScanPair
 
 OURS = "ours"

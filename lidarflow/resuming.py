@@ -6,11 +6,12 @@ from enum import Enum
 from pathlib import Path
 
 from lidarflow import io, provenance, run_folder
-from lidarflow.config import Config, load, to_dict
+from lidarflow.config import Config, load
 from lidarflow.datasets.rgbd_folders import RgbdSource
 from lidarflow.errors import DataError
 from lidarflow.provenance import RunSource
 from lidarflow.rgbd_config import RgbdConfig
+from lidarflow.settings import to_dict
 
 _NAMED = 3                     # how many settings a message shows
 

@@ -1,11 +1,11 @@
 """Every setting of the RGB-D method (Jaimez et al. 2017), frozen, with its unit and effect.
 
-Read, overridden and described by config.py, as the LiDAR settings are: `config.load(kind=RgbdConfig)`.
+Read, overridden and described as the LiDAR settings are: `config.load(kind=RgbdConfig)`.
 """
 
 from dataclasses import dataclass, field
 
-from lidarflow.config import setting
+from lidarflow.settings import setting
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lidarflow import config as settings
-from lidarflow import io, pose
+from lidarflow import io, pose, settings
 from lidarflow.errors import DataError
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdResult

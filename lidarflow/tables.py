@@ -10,11 +10,12 @@ from rich.table import Table
 
 from lidarflow import pose, provenance, run_folder
 from lidarflow.compare import Comparison
-from lidarflow.config import Config, describe
+from lidarflow.config import Config
 from lidarflow.metrics import Alignment
 from lidarflow.pair_reports import NO_TRUTH, PairReport, figures_of, mean_of, truth_of
 from lidarflow.resuming import damaged_files
 from lidarflow.runner import Going, is_complete
+from lidarflow.settings import describe
 from lidarflow.stepping import Skipped
 from lidarflow.types import FlowResult, ScanPair
 

@@ -26,6 +26,7 @@ from lidarflow.errors import DataError
 from lidarflow.rgbd import pyramid
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult
+from lidarflow.settings import updated
 
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = settings.load(ROOT / "configs" / "rgbd" / "jaimez2017.toml", kind=RgbdConfig)
@@ -91,7 +92,7 @@ def drift_table(folders: list[Path], config: RgbdConfig) -> str:
         if (path / "groundtruth.txt").is_file():
             poses = tum.read_poses(path / "groundtruth.txt")
             given[", poses 20 ms earlier"] = tum.poses_at(times_ns - CLOCK_NS, *poses)
-        full = settings.updated(config, {"images": {"width": folder.camera.width}})
+        full = updated(config, {"images": {"width": folder.camera.width}})
         for name, method, chosen in (("ours", "ours", config), ("Open3D", "open3d", config),
                                      ("Open3D, full size", "open3d", full)):
             steps, moving = steps_of(method, folder, chosen)
@@ -114,7 +115,7 @@ def second(value: float) -> str:
 def rooms_table(count: int, config: RgbdConfig) -> str:
     """Errors in `count` rendered rooms of each kind, whose truth is known: median and worst pair."""
     camera = Camera.from_field_of_view(320, 240)
-    plain = settings.updated(config, {"segmentation": {"enabled": False}})
+    plain = updated(config, {"segmentation": {"enabled": False}})
     ways = {"ours": ("ours", config), "ours, no segmentation": ("ours", plain),
             "ours, the paper's settings": ("ours", PAPER), "Open3D odometry": ("open3d", config)}
     rows = []
@@ -146,7 +147,7 @@ def spread(scores: list[rgbd_metrics.RgbdScores], name: str, worst, factor: floa
 def exposures_table(count: int, config: RgbdConfig) -> str:
     """Errors in `count` rendered rooms of each kind where the second image has another gain and offset."""
     camera = Camera.from_field_of_view(320, 240)
-    left = settings.updated(config, {"images": {"max_exposure_change": 1.0}})
+    left = updated(config, {"images": {"max_exposure_change": 1.0}})
     rows = []
     for room, (make, frames) in ROOMS.items():
         pairs = []

@@ -11,10 +11,11 @@ from shared_data import SHARED, needs_shared
 
 from lidarflow import baselines, methods, pose, synthetic
 from lidarflow.baselines import ransac
-from lidarflow.config import Config, EgoConfig, load, to_dict, updated
+from lidarflow.config import Config, EgoConfig, load
 from lidarflow.datasets import open_dataset
 from lidarflow.errors import ConfigError, DataError
 from lidarflow.lidar import features, matching, odometry
+from lidarflow.settings import to_dict, updated
 from lidarflow.types import FlowResult, Scan, ScanPair
 
 NAMES = tuple(name for name in methods.METHODS if name != methods.OURS)

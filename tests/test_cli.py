@@ -25,6 +25,7 @@ from lidarflow import (
     pose,
     rerun_streams,
     run_folder,
+    settings,
     synthetic,
     tables,
 )
@@ -91,7 +92,7 @@ def test_usage_errors_exit_with_2(lidarflow):
 def test_config_shows_every_setting_and_its_default(lidarflow):
     out = lidarflow.ok("config")
     words = out.split()
-    for name, default, _, effect in config.describe():
+    for name, default, _, effect in settings.describe(config.Config):
         assert name in words and effect.split()[0] in words
         assert default in words or f"{float(default):.4g}" in words
     assert fits_80_columns(out)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from shared_data import ROOT
 
-from lidarflow.config import Config, describe, given, load, read_toml, to_dict, updated
+from lidarflow.config import Config, given, load
 from lidarflow.errors import ConfigError
 from lidarflow.pipeline import FlowEstimator, estimate_flow
 from lidarflow.rgbd_config import RgbdConfig
+from lidarflow.settings import describe, read_toml, to_dict, updated
 
 FILES = ([(Config, file) for file in sorted((ROOT / "configs").glob("*.toml"))]
          + [(RgbdConfig, file) for file in sorted((ROOT / "configs" / "rgbd").glob("*.toml"))])
@@ -150,7 +151,7 @@ def test_plain_values_give_the_same_settings_back():
 
 
 def test_every_setting_is_described_with_an_effect_and_keeps_its_own_limits():
-    rows = describe()
+    rows = describe(Config)
     expected = [f"{section.name}.{f.name}" for section in fields(Config)
                 for f in fields(section.default_factory)]
     assert [key for key, *_ in rows] == expected and len(expected) > 30

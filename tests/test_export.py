@@ -10,7 +10,7 @@ from argoverse_log import TIMES, write_log
 from command_line import drive, rests
 from run_folders import STATS, flows, write_run
 
-from lidarflow import colour, config, export, flow_files, pose, provenance, synthetic
+from lidarflow import colour, config, export, flow_files, pose, provenance, settings, synthetic
 from lidarflow.datasets import open_dataset, read_points
 from lidarflow.datasets.argoverse2 import read_columns
 from lidarflow.types import FlowResult
@@ -41,8 +41,8 @@ def log_run(tmp_path):
 def make_unknown(file):
     found = flow_files.load_flow(file)
     found.points[0] = found.flow[0] = np.nan
-    settings = config.updated(config.Config(), found.config, str(file))
-    flow_files.save_flow(file, found.points, found.result(), settings)
+    used = settings.updated(config.Config(), found.config, str(file))
+    flow_files.save_flow(file, found.points, found.result(), used)
 
 
 def table(file):

@@ -13,6 +13,7 @@ from cloud_files import message
 from lidarflow import config as settings
 from lidarflow import flow_files, io, pose, run_folder
 from lidarflow.config import Config
+from lidarflow.settings import updated
 from lidarflow.types import FlowResult, SolveStats
 
 
@@ -65,7 +66,7 @@ def test_a_flow_file_comes_back(saved):
     for name in ("valid", "in_graph", "is_dynamic", "is_ground", "object_id", "ego_motion"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(result, name))
         np.testing.assert_array_equal(getattr(back, name), getattr(result, name))
-    assert settings.updated(Config(), loaded.config) == Config()
+    assert updated(Config(), loaded.config) == Config()
     assert SolveStats(**loaded.stats) == back.stats == result.stats
     np.testing.assert_allclose(back.flow, result.flow, rtol=1e-5)
 

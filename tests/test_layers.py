@@ -13,6 +13,7 @@ LAYERS = [
      "stopwatch"},
     {"checks", "rgbd_colour"},    # they use pose, and colour
     {"types", "rgbd_types"},
+    {"settings"},
     {"config"},
     {"rgbd_config"},
     {"lidar", "rgbd", "solve", "datasets", "synthetic"},

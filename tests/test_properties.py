@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from lidarflow import metrics, pose
-from lidarflow.config import Config, describe, load, to_dict, updated
+from lidarflow.config import Config, load
 from lidarflow.errors import ConfigError, DataError, LidarflowError
 from lidarflow.methods import METHODS
 from lidarflow.pipeline import FlowEstimator, estimate_flow
+from lidarflow.settings import describe, to_dict, updated
 from lidarflow.types import FlowResult, Scan, ScanPair, Truth
 
 LENIENT = settings(deadline=None, derandomize=True,
@@ -113,7 +114,7 @@ def test_a_sequence_goes_on_after_what_it_cannot_use(clouds):
 
 # Settings.
 
-KEYS = [key for key, *_ in describe()]
+KEYS = [key for key, *_ in describe(Config)]
 TEXTS = st.one_of(st.text(max_size=20), st.integers().map(str), st.floats().map(str),
                   st.sampled_from(["true", "[1]", "{a=1}", "1e999", "0x" + "f" * 5000, "9" * 5000,
                                    "[" * 5000]))

@@ -10,9 +10,9 @@ from rgbd_worlds import QVGA, frames
 from shared_data import ROOT
 
 from lidarflow import rerun_streams, synthetic
-from lidarflow.config import read_toml
 from lidarflow.datasets.clouds import _READERS
 from lidarflow.export import FORMATS
+from lidarflow.settings import read_toml
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^    \.venv/bin/lidarflow (.*?)(?: +#.*)?$", README, re.MULTILINE)

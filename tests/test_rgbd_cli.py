@@ -12,7 +12,7 @@ from command_line import rests
 from PIL import Image
 from rgbd_worlds import FRAMES, QVGA, copied, frames
 
-from lidarflow import config, demo, pose, rgbd, rgbd_io, rgbd_methods, synthetic
+from lidarflow import demo, pose, rgbd, rgbd_io, rgbd_methods, settings, synthetic
 from lidarflow.datasets.rgbd_folders import open_rgbd
 from lidarflow.datasets.rgbd_images import read_frame
 from lidarflow.rgbd_config import RgbdConfig
@@ -87,7 +87,7 @@ def test_help_loads_nothing_heavy_and_fits_80_columns(lidarflow):
 
 def test_config_shows_every_setting(lidarflow):
     words = lidarflow.ok("rgbd", "config").split()
-    for name, _, _, effect in config.describe(RgbdConfig):
+    for name, _, _, effect in settings.describe(RgbdConfig):
         assert name in words and effect.split()[0] in words
 
 
@@ -331,7 +331,7 @@ def changed(stored, path, **arrays):
 def test_a_flow_file_reads_back(stored):
     found = rgbd_io.load_flow(stored)
     assert rgbd_io.is_rgbd_flow(stored) and found.stats["method"] in rgbd_methods.METHODS
-    assert found.config == config.to_dict(RgbdConfig()) and found.color.shape == (240, 320, 3)
+    assert found.config == settings.to_dict(RgbdConfig()) and found.color.shape == (240, 320, 3)
     moved = found.result.odometry_flow()
     still = found.result.valid & (np.nan_to_num(found.result.b_image, nan=1.0) == 0)
     assert np.median(np.linalg.norm((found.result.flow - moved)[still], axis=-1)) < 1e-3

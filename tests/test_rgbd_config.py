@@ -5,9 +5,10 @@ from dataclasses import fields
 import pytest
 from shared_data import ROOT
 
-from lidarflow.config import describe, load, to_dict, updated
+from lidarflow.config import load
 from lidarflow.errors import ConfigError
 from lidarflow.rgbd_config import RgbdConfig
+from lidarflow.settings import describe, to_dict, updated
 
 FILES = sorted((ROOT / "configs" / "rgbd").glob("*.toml"))
 

@@ -6,7 +6,7 @@ import rgbd_corner
 from rgbd_corner import QVGA
 from scipy import optimize
 
-from lidarflow import config, pose
+from lidarflow import pose, settings
 from lidarflow.errors import DataError
 from lidarflow.kernels import cluster_images
 from lidarflow.rgbd import clusters as geometric
@@ -218,7 +218,7 @@ def test_the_closed_form_is_the_minimum_of_the_energy(seed, first):
 
 
 def test_residuals_far_from_the_thresholds_decide_and_distance_speaks_for_static():
-    loose = config.updated(DEFAULTS, {"segmentation": {"smoothness": 0.0}}).segmentation
+    loose = settings.updated(DEFAULTS, {"segmentation": {"smoothness": 0.0}}).segmentation
     centres = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 1.0], [0, 0, 4.0]], np.float32)
     clusters = geometric.Clusters(centres, (), np.eye(4, dtype=bool))
     b = segmentation.minimise(np.array([0.0, 0.015, 0.05, 0.05]), 0.01, 0.02, clusters, None, loose)

@@ -9,7 +9,7 @@ import rgbd_corner
 from rgbd_worlds import HALF_FRAMES, QVGA, ROOMS, frames, moving_share
 from shared_data import ROOT, SHARED, needs_shared
 
-from lidarflow import config, pose, rgbd_methods, rgbd_metrics
+from lidarflow import config, pose, rgbd_methods, rgbd_metrics, settings
 from lidarflow.datasets.rgbd_folders import open_rgbd
 from lidarflow.errors import DataError
 from lidarflow.rgbd import RgbdEstimator, estimate_flow, odometry, pyramid
@@ -17,7 +17,7 @@ from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_types import Camera, RgbdFrame, RgbdPair, RgbdResult
 
 DEFAULTS = RgbdConfig()
-PLAIN = config.updated(DEFAULTS, {"segmentation": {"enabled": False}})
+PLAIN = settings.updated(DEFAULTS, {"segmentation": {"enabled": False}})
 PAPER_FILE = ROOT / "configs" / "rgbd" / "jaimez2017.toml"
 MOTION = pose.exp(np.array([0.012, -0.02, 0.01, 0.03, -0.015, 0.02]))
 # Photometric and geometric residuals of the paper's Table III.

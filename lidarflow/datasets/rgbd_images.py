@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lidarflow import config
+from lidarflow import settings
 from lidarflow.datasets.clouds import one_line
 from lidarflow.errors import DataError
 from lidarflow.rgbd_types import Camera, RgbdFrame
@@ -70,7 +70,7 @@ def image_size(path: Path) -> tuple[int, int]:
 def read_camera(path: Path) -> Camera:
     """The camera of a TOML file with width, height, fx, fy, cx, cy in pixels; DataError or ConfigError."""
     path = Path(path)
-    found = config.read_toml(path, "camera")
+    found = settings.read_toml(path, "camera")
     expected = ("width", "height", *_INTRINSICS)
     unknown, missing = sorted(found.keys() - set(expected)), [key for key in expected if key not in found]
     if unknown or missing:

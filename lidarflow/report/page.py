@@ -11,10 +11,11 @@ from markupsafe import Markup
 from rich.table import Table as RichTable
 
 from lidarflow import __version__, score_tables
-from lidarflow.config import Config, describe, to_dict
+from lidarflow.config import Config
 from lidarflow.metrics import POSES_ONLY, Interval
 from lidarflow.report import plots
 from lidarflow.report.reading import Run, SeenObject
+from lidarflow.settings import describe, to_dict
 from lidarflow.tables import run_notes, run_table
 
 _MOST_PAIR_ROWS, _MOST_OBJECT_ROWS = 60, 25
@@ -177,7 +178,7 @@ def settings_tables(config: Config) -> tuple[Table, Table]:
     """The settings that differ from the defaults, with both values, and those that do not."""
     used, default = to_dict(config), to_dict(Config())
     changed, kept = [], []
-    for key, _, _, effect in describe():
+    for key, _, _, effect in describe(Config):
         section, _, name = key.partition(".")
         value, usual = used[section][name], default[section][name]
         if value == usual:
