@@ -24,6 +24,10 @@ class InputError(DataError, ValueError):
     """What a program hands over is no scan, frame or camera; also the ValueError that Python would raise."""
 
 
+class OutOfRangeError(DataError, IndexError):
+    """A data set has no scan or frame of this number; also the IndexError that Python would raise."""
+
+
 class SolveError(LidarflowError):
     """The optimiser could not produce an answer for a well-formed problem."""
 

@@ -30,6 +30,48 @@ def test_a_folder_is_read_in_natural_order(tmp_path):
     assert "no scan -1" in message(data.scan, -1)
 
 
+def test_a_data_set_is_iterated_and_indexed(tmp_path):
+    for number in range(3):
+        write_bin(tmp_path / f"scan{number}.bin", POINTS + number)
+    data = open_dataset(tmp_path)
+    assert [scan.name for scan in data] == [scan.name for scan in data] == ["scan0", "scan1", "scan2"]
+    assert [data[k].name for k in (0, np.int64(1), -1, -3)] == ["scan0", "scan1", "scan2", "scan0"]
+    assert [scan.name for scan in reversed(data)] == ["scan2", "scan1", "scan0"]
+    np.testing.assert_array_equal(data[-2].points, data.scan(1).points)
+
+
+@pytest.mark.parametrize("index", [3, -4])
+def test_outside_a_data_set_is_an_error_of_ours_and_of_python(tmp_path, index):
+    for number in range(3):
+        write_bin(tmp_path / f"scan{number}.bin")
+    data = open_dataset(tmp_path)
+    for ask in (data.scan, data.__getitem__):
+        with pytest.raises(IndexError) as caught:
+            ask(index)
+        assert isinstance(caught.value, DataError)
+        assert str(caught.value) == f"{data.name}: no scan {index}; there are 3, from 0 on"
+
+
+@pytest.mark.parametrize("index", [slice(0, 2), 1.0, "1", True, None])
+def test_what_is_no_number_of_a_scan(tmp_path, index):
+    write_bin(tmp_path / "scan0.bin")
+    data = open_dataset(tmp_path)
+    for ask in (data.scan, data.__getitem__):
+        with pytest.raises(InputError) as caught:
+            ask(index)
+        assert str(caught.value) == f"{data.name}: scan {index!r}; expected the number of a scan, from 0 on"
+
+
+def test_scans_are_read_when_their_turn_comes(tmp_path):
+    for number in range(3):
+        write_bin(tmp_path / f"scan{number}.bin")
+    (tmp_path / "scan1.bin").write_bytes(b"no points")
+    scans = iter(open_dataset(tmp_path))
+    assert next(scans).name == "scan0"
+    with pytest.raises(DataError, match=r"scan1\.bin"):
+        next(scans)
+
+
 def test_a_folder_of_clouds_has_the_truth_that_lies_in_it(tmp_path):
     for number in (4, 5):
         write_bin(tmp_path / f"{number:06d}.bin")
@@ -412,6 +454,9 @@ def test_loaders_of_kiss_icp_are_wrapped_and_silenced(tmp_path, monkeypatch, cap
     for index in (0, 1, 1, 2, 0):
         np.testing.assert_allclose(data.scan(index).points[0], POINTS[0] + index)
     assert data.scan(2).time_ns == 1_700_000_000_400_000_000 and data.scan(2).name == "000002"
+    for _ in range(2):
+        assert [scan.points[0, 0] - POINTS[0, 0] for scan in data] == pytest.approx([0, 1, 2])
+    assert data[-1].name == "000002" and "no scan -4" in message(data.__getitem__, -4)
     np.testing.assert_allclose(data.world_from_sensor(), pose.identity(3))
     assert len(data) == 3 and data.truth(0) is None and "rosbag" in data.note
     assert capsys.readouterr().out == ""

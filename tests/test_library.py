@@ -221,6 +221,7 @@ def test_the_program_that_is_type_checked_runs(kitti, scans):
     assert typed_use.of_two_arrays(source, target).flow.shape == source.shape
     speeds = typed_use.along(kitti)
     assert speeds and min(speeds) > 0.3
+    assert typed_use.first_to_last(kitti).flow.shape == source.shape
 
 
 @pytest.mark.slow

@@ -105,6 +105,7 @@ def test_velodyne_recordings_that_hold_nothing(tmp_path):
     empty = open_dataset(write_pcap(tmp_path / "d.pcap", velodyne_packets(0.0)))
     assert "scan 0 is empty" in message(empty.scan, 0)
     assert "no scan 9" in message(empty.scan, 9)
+    assert "scan 0 is empty" in message(next, iter(empty)) and "no scan -9" in message(empty.__getitem__, -9)
 
 
 @needs_shared

@@ -216,6 +216,18 @@ def test_a_written_folder_reads_back(folder):
     np.testing.assert_allclose(pose.inverse(poses[1]) @ poses[0], frames()[0][1].odometry, atol=1e-7)
 
 
+def test_frames_are_iterated_and_indexed(folder):
+    opened = open_rgbd(folder)
+    names = [opened.frame(k).name for k in range(4)]
+    assert [frame.name for frame in opened] == names and opened[-1].name == names[3]
+    np.testing.assert_array_equal(opened[1].depth, opened.frame(1).depth)
+    for ask, index in ((opened.frame, 4), (opened.frame, -1), (opened.__getitem__, -5)):
+        with pytest.raises(IndexError) as caught:
+            ask(index)
+        assert isinstance(caught.value, DataError)
+        assert str(caught.value) == f"{opened.name}: no frame {index}; there are 4, from 0 on"
+
+
 def test_images_that_are_listed_but_missing_are_passed_over(folder, tmp_path):
     place = copied(folder, tmp_path / "part")
     for kind in ("rgb", "depth"):

@@ -38,3 +38,12 @@ def along(folder: Path) -> list[float]:
             speeds += [float(np.linalg.norm(moving.velocity)) for moving in found]
             assert result.object_id.shape == result.std_m.shape == result.is_ground.shape
     return speeds
+
+
+def first_to_last(folder: Path) -> FlowResult:
+    """Flow from a data set's first scan to its last."""
+    dataset = lidarflow.open_dataset(folder)
+    names: list[str] = [scan.name for scan in dataset]
+    assert [dataset[0].name, dataset[-1].name] == [names[0], names[-1]]
+    settings = lidarflow.load(overrides=("solver.method=fast",))
+    return lidarflow.estimate_flow((dataset[0], dataset[-1]), settings)

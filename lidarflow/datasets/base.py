@@ -2,17 +2,18 @@
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from lidarflow.checks import is_whole
 from lidarflow.datasets import clouds
 from lidarflow.datasets.kitti_correction import correct_vertical_angle
-from lidarflow.errors import DataError, InputError
+from lidarflow.datasets.one_by_one import OneByOne
+from lidarflow.errors import DataError
 from lidarflow.types import Scan, Truth
 
 _PERIOD_NS = 100_000_000     # of 10 Hz
@@ -33,7 +34,7 @@ class Source:
 
 
 class Dataset(Protocol):
-    """A sequence of scans from one sensor, in order of time.
+    """A sequence of scans from one sensor, in order of time; `for scan in dataset` reads one after the other.
 
     name    what messages call it, e.g. "kitti 00"
     loader  the name that `open_dataset` knows it by
@@ -48,8 +49,13 @@ class Dataset(Protocol):
 
     def __len__(self) -> int: ...
 
+    def __iter__(self) -> Iterator[Scan]: ...
+
+    def __getitem__(self, index: int) -> Scan:
+        """As `scan`, and from the end where `index` is negative."""
+
     def scan(self, index: int) -> Scan:
-        """The scan at `index`, rows in the order of its file."""
+        """The scan at `index`, rows in the order of its file; OutOfRangeError where there is none."""
 
     def truth(self, index: int) -> Truth | None:
         """What happened from the scan at `index` to the one at `index + 1`, where it is known."""
@@ -58,7 +64,20 @@ class Dataset(Protocol):
         """Given poses (N, 4, 4) of the sensor, one per scan, where they are known."""
 
 
-class ScanFiles:
+class Scans(OneByOne[Scan]):
+    """What every data set of scans is, whoever reads them: `scan` by number, and one by one."""
+
+    item = "scan"
+
+    @abstractmethod
+    def scan(self, index: int) -> Scan:
+        """The scan at `index`; DataError where there is none or it cannot be read."""
+
+    def _item(self, index: int) -> Scan:
+        return self.scan(index)
+
+
+class ScanFiles(Scans):
     """Scans in one file each; loaders add the truth and the poses that they know of.
 
     files     in order of time, no two of one name but for suffix and capitals
@@ -93,8 +112,7 @@ class ScanFiles:
 
     def stored_points(self, index: int) -> np.ndarray:
         """Points (N, 3) of the scan at `index` as its file holds them, without a correction."""
-        check_index(self, index)
-        return self._read(self.files[index])
+        return self._read(self.files[self.check_index(index)])
 
     def truth(self, index: int) -> Truth | None:
         """Nothing is known unless a loader says otherwise."""
@@ -121,14 +139,6 @@ def _far_apart(times_ns: Sequence[int]) -> list[str]:
     if apart_s <= _MOST_APART_S:
         return []
     return [f"scans are {apart_s:.6g} s apart by their times; are those seconds?"]
-
-
-def check_index(dataset: Dataset, index: int) -> None:
-    """Raise DataError unless `index` is one of the data set's scans, InputError unless it is whole."""
-    if not is_whole(index):
-        raise InputError(f"{dataset.name}: scan {index!r}; expected the number of a scan, from 0 on")
-    if not 0 <= index < len(dataset):
-        raise DataError(f"{dataset.name}: no scan {index}; there are {len(dataset)}, from 0 on")
 
 
 def frame_number(file: Path) -> int | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarflow import pose
 from lidarflow.datasets import point_cloud2
-from lidarflow.datasets.base import Source, assumed_times, check_index
+from lidarflow.datasets.base import Scans, Source, assumed_times
 from lidarflow.datasets.foreign import Stream, guarded
 from lidarflow.datasets.kitti_correction import correct_vertical_angle, is_wanted
 from lidarflow.errors import DataError
@@ -18,7 +18,7 @@ from lidarflow.types import Scan, Truth
 STREAMS = ("mcap", "rosbag")     # read forwards only, whatever index is asked for
 
 
-class KissLoader:
+class KissLoader(Scans):
     """Scans and poses as KISS-ICP's loader of this name gives them; times assume 10 Hz.
 
     For recordings of several topics (mcap, rosbag) the sequence is the topic, and times are those of the
@@ -63,8 +63,8 @@ class KissLoader:
 
     def scan(self, index: int) -> Scan:
         """The scan at `index`; DataError where the loader cannot read it."""
-        check_index(self, index)
-        item, time_ns = guarded(self._origin, lambda: self._item(index))
+        index = self.check_index(index)
+        item, time_ns = guarded(self._origin, lambda: self._read(index))
         points = np.array(item[0] if isinstance(item, tuple | list) else item, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] < 3 or not np.isfinite(points[:, :3]).any():
             raise DataError(f"{self._origin} gave an array {points.shape} for scan {index}; "
@@ -81,7 +81,7 @@ class KissLoader:
         """Given poses (N, 4, 4) where the loader has one per scan."""
         return self._poses
 
-    def _item(self, index: int) -> tuple[Any, int]:
+    def _read(self, index: int) -> tuple[Any, int]:
         """What the loader has for `index`, and its time in ns."""
         if self._stream is not None:
             return self._stream.item(index)

@@ -1,18 +1,18 @@
 """What recordings of a sensor share: one file, scans by index, times of the sensor, nothing else known."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from pathlib import Path
 
 import numpy as np
 
-from lidarflow.datasets.base import Source, check_index
+from lidarflow.datasets.base import Scans, Source
 from lidarflow.datasets.foreign import guarded
 from lidarflow.datasets.kitti_correction import correct_vertical_angle, is_wanted
 from lidarflow.errors import DataError
 from lidarflow.types import Scan, Truth
 
 
-class Recording(ABC):
+class Recording(Scans):
     """A file that the package called `reader` reads; loaders count and read its scans."""
 
     loader: str
@@ -31,12 +31,9 @@ class Recording(ABC):
         if self._correct:
             self.note += "; KITTI vertical-angle correction on"
 
-    @abstractmethod
-    def __len__(self) -> int: ...
-
     def scan(self, index: int) -> Scan:
         """The scan at `index`; DataError where it cannot be read, or nothing was seen."""
-        check_index(self, index)
+        index = self.check_index(index)
         points, time_ns = guarded(self._origin, lambda: self._read(index))
         if not np.isfinite(points).all(axis=1).any():
             raise DataError(f"{self.file}: scan {index} is empty (no return); see --jump and --n-scans")

@@ -9,6 +9,7 @@ import numpy as np
 from lidarflow.datasets import clouds, tables, tum
 from lidarflow.datasets.base import frame_number, in_words_of_the_file
 from lidarflow.datasets.folder import folder_name
+from lidarflow.datasets.one_by_one import OneByOne
 from lidarflow.datasets.rgbd_images import (
     DEFAULT_DEPTH_SCALE,
     camera_of,
@@ -63,8 +64,8 @@ class RgbdSource:
     depth_scale: float
 
 
-class RgbdFolder:
-    """A sequence of RGB-D frames from the files of a folder.
+class RgbdFolder(OneByOne[RgbdFrame]):
+    """A sequence of RGB-D frames from the files of a folder; `for frame in folder` reads one after the other.
 
     name    what messages call it
     layout  "tum" or "images"
@@ -72,6 +73,8 @@ class RgbdFolder:
     camera  Camera
     source  RgbdSource
     """
+
+    item = "frame"
 
     def __init__(self, folder: Path, listing: _Listing, camera: Camera, origin: str):
         clouds.check_names(listing.color)
@@ -87,13 +90,16 @@ class RgbdFolder:
         return len(self._files.color)
 
     def frame(self, index: int) -> RgbdFrame:
-        """The frame at `index`; DataError where its files are damaged."""
-        files = self._files
+        """The frame at `index`; DataError where there is none or its files are damaged."""
+        files, index = self._files, self.check_index(index)
         frame = read_frame(files.color[index], files.depth[index], files.depth_scale, files.times_ns[index],
                            files.names[index])
         height, width = frame.shape
         check_camera(self.camera, width, height, files.color[index], "the camera of the images")
         return frame
+
+    def _item(self, index: int) -> RgbdFrame:
+        return self.frame(index)
 
     def truth(self, index: int) -> RgbdTruth | None:
         """What happened from the frame at `index` to the next, where truth/<frame>.npz tells it."""
