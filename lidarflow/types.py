@@ -69,6 +69,11 @@ class ScanPair:
         dt = (self.target.time_ns - self.source.time_ns) * 1e-9
         return dt if dt > 0 else 0.1
 
+    @property
+    def repeats(self) -> bool:
+        """Whether the target is the source once more, as recorders write it where a sweep was lost."""
+        return np.array_equal(self.source.points, self.target.points, equal_nan=True)
+
 
 def as_pair(pair: Any) -> ScanPair:
     """A ScanPair as it is, or one of a source and a target; InputError for anything but two scans."""

@@ -7,6 +7,7 @@ from lidarflow import pose, synthetic
 from lidarflow.lidar import tracking
 from lidarflow.lidar.tracking import Tracks
 from lidarflow.pipeline import FlowEstimator
+from lidarflow.types import Scan
 
 EGO = pose.from_yaw(0.02, (-0.8, 0.05, 0.0))
 STEP = pose.from_translation([0.9, 0.0, 0.0])
@@ -86,6 +87,24 @@ def test_a_turning_object_goes_on_along_its_circle_as_the_sensor_moves():
 def test_equal_times_let_no_rounding_in():
     track = tracking.advance(Tracks(), [0], [car(8.0, 2.0)], [STEP], EGO, DT_S).followed[0]
     np.testing.assert_array_equal(track.goes_on(EGO, DT_S), EGO @ STEP @ pose.inverse(EGO))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1, 5])
+def test_a_scan_that_comes_again_ends_no_id(times):
+    """Were the tracks led on meanwhile, what moves by its own length would be another object afterwards."""
+    scans = [scan for scan, _ in synthetic.scan_sequence(
+        synthetic.street(rng(1)), synthetic.hdl64e(900), 3, rng(2))]
+    again = [Scan(scans[1].points, scans[1].time_ns + (k + 1) * 10**8) for k in range(times)]
+    late = Scan(scans[2].points, scans[2].time_ns + times * 10**8)
+    plain, stuttering = FlowEstimator(), FlowEstimator()
+    expected, after = [[estimator.step(scan) for scan in sequence][-1] for estimator, sequence in (
+        (plain, scans), (stuttering, [*scans[:2], *again, late]))]
+    assert len(expected.objects) > 5
+    places = [{found.id: found.box_centre for found in result.objects} for result in (expected, after)]
+    assert places[0].keys() == places[1].keys()
+    for number, centre in places[0].items():
+        np.testing.assert_allclose(places[1][number], centre, atol=0.3)
 
 
 @pytest.mark.slow

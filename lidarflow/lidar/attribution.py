@@ -113,9 +113,12 @@ def attribute(
     described = tuple(
         objects.describe(number, cloud, motion, ego_motion, pair.dt_s)
         for number, cloud, motion in zip(ids, clouds, motions, strict=True))
+    if bodies or not pair.repeats:
+        tracks = tracking.advance(tracks, ids, clouds, over_ground, ego_motion, pair.dt_s)
+    # Else all that was followed is where it was, whatever the times say: led on, it would not be found again.
     return Attribution(
-        owner, np.array(motions).reshape(-1, 4, 4), np.array(ids, np.int32), explained, std_m,
-        described, tracking.advance(tracks, ids, clouds, over_ground, ego_motion, pair.dt_s))
+        owner, np.array(motions).reshape(-1, 4, 4), np.array(ids, np.int32), explained, std_m, described,
+        tracks)
 
 
 def _expected(tracks: Tracks, ego_motion: np.ndarray, dt_s: float) -> Expected:
