@@ -6,9 +6,9 @@ import numpy as np
 
 from lidarflow import io, rgbd_io
 from lidarflow.checkpoints import CheckpointFiles, Stretch, digest_of, naming_damage, read_bound
-from lidarflow.rgbd_types import RgbdPair, RgbdResult
+from lidarflow.rgbd_types import Exposure, RgbdPair, RgbdResult
 
-_NAMES = ("digest", "stretch", *rgbd_io.RESULT_ARRAYS, "camera", "notes")
+_NAMES = ("digest", "stretch", *rgbd_io.RESULT_ARRAYS, "camera", "exposure", "notes")
 
 
 class RgbdCheckpoints(CheckpointFiles):
@@ -19,6 +19,7 @@ class RgbdCheckpoints(CheckpointFiles):
         arrays = {name: getattr(result, name) for name in rgbd_io.RESULT_ARRAYS} | {
             "digest": np.array(_digest(pair)), "stretch": stretch.row(),
             "camera": rgbd_io.camera_row(result.camera),
+            "exposure": np.array([result.exposure.gain, result.exposure.offset]),
             "notes": np.array(json.dumps({"seconds": result.seconds}))}
         self.put(index, io.archive(arrays))
 
@@ -30,6 +31,7 @@ class RgbdCheckpoints(CheckpointFiles):
             return RgbdResult(
                 camera=rgbd_io.camera_of(arrays["camera"]),
                 seconds=json.loads(str(arrays["notes"]))["seconds"],
+                exposure=Exposure(*arrays["exposure"].tolist()),
                 **{name: arrays[name] for name in rgbd_io.RESULT_ARRAYS}), None
 
 

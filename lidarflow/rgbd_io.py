@@ -33,7 +33,7 @@ class RgbdFlowFile:
     result  RgbdResult          without its wall times
     color   (H, W, 3) uint8     the source's colours at the result's size
     config  dict                the settings it was made with
-    stats   dict                method, share of moving pixels, residuals
+    stats   dict                method, share of moving pixels, change of exposure, residuals
     """
 
     result: RgbdResult

@@ -84,10 +84,13 @@ class WarpScores:
 
 
 def warp_scores(pair: RgbdPair, result: RgbdResult) -> WarpScores:
-    """Residuals at the working size of `result`."""
+    """Residuals at the working size of `result`, of intensities as it compared them: in one exposure."""
     images = replace(ImagesConfig(), width=result.camera.width)
     source, target = (pyramid.at_working_size(frame, pair.camera, images)[0]
                       for frame in (pair.source, pair.target))
+    shown = result.exposure.undone(source.intensity, target.intensity)
+    source, target = (replace(frame, intensity=intensity)
+                      for frame, intensity in zip((source, target), shown, strict=True))
     odometry_flow = result.odometry_flow()
     return WarpScores(*(residuals(source, target, result.camera, flow)
                         for flow in (np.zeros_like(odometry_flow), odometry_flow, result.flow)))

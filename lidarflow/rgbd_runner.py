@@ -14,7 +14,7 @@ from lidarflow.resuming import Plan
 from lidarflow.rgbd_checkpoints import RgbdCheckpoints
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.rgbd_metrics import DepthStatistics, Drift, RgbdScores, WarpScores
-from lidarflow.rgbd_types import RgbdPair, RgbdResult, RgbdTruth
+from lidarflow.rgbd_types import Exposure, RgbdPair, RgbdResult, RgbdTruth
 from lidarflow.runner import OUTPUT_STAGE, Going, Viewing, begun_steps, finish, plan_of, recording
 from lidarflow.stepping import Step, Walk
 from lidarflow.trajectory import Trajectory
@@ -27,6 +27,7 @@ class RgbdReport:
     moving_share  float   of the pixels with depth
     depth         DepthStatistics of the source frame
     residuals     WarpScores
+    exposure      Exposure, the change that was undone before images were compared
     scores        RgbdScores, None without a truth
     drift         Drift of this step against given poses, None without
     """
@@ -35,6 +36,7 @@ class RgbdReport:
     moving_share: float
     depth: DepthStatistics
     residuals: WarpScores
+    exposure: Exposure
     scores: RgbdScores | None
     drift: Drift | None
     seconds: dict[str, float]
@@ -114,6 +116,7 @@ def report_pair(pair: RgbdPair, result: RgbdResult, truth: RgbdTruth | None = No
         moving_share=float(result.is_dynamic[result.valid].mean()) if result.valid.any() else 0.0,
         depth=rgbd_metrics.depth_statistics(pair.source.depth),
         residuals=rgbd_metrics.warp_scores(pair, result),
+        exposure=result.exposure,
         scores=None if truth is None else rgbd_metrics.score(result, truth),
         drift=drift,
         seconds=result.seconds,
@@ -122,7 +125,8 @@ def report_pair(pair: RgbdPair, result: RgbdResult, truth: RgbdTruth | None = No
 
 def stats_of(method: str, report: RgbdReport) -> dict:
     """What a flow file says of its pair."""
-    return {"method": method, "moving_share": report.moving_share, "residuals": asdict(report.residuals)}
+    return {"method": method, "moving_share": report.moving_share, "exposure": asdict(report.exposure),
+            "residuals": asdict(report.residuals)}
 
 
 def metrics_of(run: RgbdRun) -> dict:

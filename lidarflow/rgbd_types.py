@@ -136,6 +136,25 @@ class RgbdPair:
                     f"has, got {width}x{height}")
 
 
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """How the exposure changed within a pair: target = gain · source + offset; 1 and 0 where it did not."""
+
+    gain: float = 1.0
+    offset: float = 0.0
+
+    def undone(self, source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Intensities (H, W) float32 of both images in the source's exposure, themselves where none changed.
+
+        Both are cut off at what either exposure can show.
+        """
+        if self == Exposure():
+            return source, target
+        low, high = max(0.0, -self.offset / self.gain), min(1.0, (1.0 - self.offset) / self.gain)
+        as_source = source, (target - self.offset) / self.gain
+        return tuple(np.clip(intensity, low, high).astype(np.float32) for intensity in as_source)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbdResult:
     """The answer for one pair, images (H, W) of the working size, rows and columns as in the source frame.
@@ -152,6 +171,7 @@ class RgbdResult:
     camera           Camera              of the working size
     centres          (K, 3) float32      metres, the clusters' centres, source camera frame
     seconds          dict                wall time of each stage
+    exposure         Exposure            the change that was undone before the images were compared
     """
 
     flow: np.ndarray
@@ -165,6 +185,7 @@ class RgbdResult:
     camera: Camera
     centres: np.ndarray
     seconds: dict[str, float] = field(default_factory=dict)
+    exposure: Exposure = Exposure()
 
     def __post_init__(self):
         check("RgbdResult.valid", self.valid, (self.camera.height, self.camera.width), "b")

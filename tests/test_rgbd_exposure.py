@@ -1,6 +1,7 @@
 """Exposure that changes between two frames, and what must not be taken for it."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ import rgbd_corner
 from rgbd_worlds import QVGA, frames
 
 from lidarflow import pose, rgbd_metrics
+from lidarflow.config import load
 from lidarflow.rgbd import RgbdEstimator, estimate_flow, exposure, pyramid
 from lidarflow.rgbd_config import RgbdConfig
-from lidarflow.rgbd_types import RgbdFrame, RgbdPair
+from lidarflow.rgbd_types import Exposure, RgbdFrame, RgbdPair
 
 DEFAULTS = RgbdConfig()
 MOTION = pose.exp(np.array([0.012, -0.02, 0.01, 0.03, -0.015, 0.02]))
@@ -74,7 +76,7 @@ def test_what_changes_in_a_part_of_the_image_is_no_exposure(change):
 def test_both_images_become_those_of_one_exposure(gain, offset):
     pair = rgbd_corner.pair(MOTION)
     plain = levels(pair.source), levels(exposed(pair.target, gain, offset))
-    source, target = exposure.matched(*plain, MOTION, DEFAULTS)
+    source, target, _ = exposure.matched(*plain, MOTION, DEFAULTS)
     found = exposure.between(source[0], target[0], MOTION)
     np.testing.assert_allclose(found[:2], (1.0, 0.0), atol=0.02)
     assert found[2] < 0.01 and exposure.between(plain[0][0], plain[1][0], MOTION)[2] > 0.05
@@ -101,6 +103,30 @@ def test_odometry_and_segmentation_are_as_good_after_a_jump(name, gain, offset):
     assert found.odometry_error_deg < plain.odometry_error_deg + 0.01
     assert found.iou > plain.iou - 0.05
     assert found.epe_m < plain.epe_m + 0.003     # twice as bright, half of the texture is cut off
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.3, 0.1), (0.7, -0.05)])
+def test_residuals_are_of_the_images_that_were_compared(gain, offset):
+    """What is left is what texture leaves, not what the exposure changed."""
+    (source, _), (target, _) = frames("living_room")[:2]
+    plain, jumped = RgbdPair(source, target, QVGA), RgbdPair(source, exposed(target, gain, offset), QVGA)
+    usual, found = (rgbd_metrics.warp_scores(pair, estimate_flow(pair)) for pair in (plain, jumped))
+    result = estimate_flow(jumped)
+    assert (result.exposure.gain, result.exposure.offset) == pytest.approx((gain, offset), abs=0.03)
+    assert found.after.photometric == pytest.approx(usual.after.photometric, abs=0.005)
+    assert found.before.photometric == pytest.approx(usual.before.photometric, abs=0.005)
+    raw = rgbd_metrics.warp_scores(jumped, replace(result, exposure=Exposure()))
+    assert raw.after.photometric > 2 * found.after.photometric
+    assert raw.after.geometric_m == found.after.geometric_m
+
+
+def test_an_exposure_that_did_not_change_is_told_as_none():
+    (source, _), (target, _) = frames("living_room")[:2]
+    assert estimate_flow(RgbdPair(source, target, QVGA)).exposure == Exposure(1.0, 0.0)
+    never = load(overrides=("images.max_exposure_change=1",), kind=RgbdConfig)
+    brighter = RgbdPair(source, exposed(target, 1.05, 0.0), QVGA)
+    assert estimate_flow(brighter).exposure.gain > 1.02
+    assert estimate_flow(brighter, never).exposure == Exposure()
 
 
 def test_a_jump_is_of_one_pair_and_not_of_the_next():

@@ -6,6 +6,7 @@ from lidarflow import pose
 from lidarflow.rgbd import pyramid
 from lidarflow.rgbd.pyramid import Level
 from lidarflow.rgbd_config import RgbdConfig
+from lidarflow.rgbd_types import Exposure
 from lidarflow.robust import cauchy
 
 _GREY = 1.0 / 255.0
@@ -21,22 +22,18 @@ _SAME_SURFACE = 0.1          # of the depth: what differs by more hides the surf
 def matched(
     source: tuple[Level, ...], target: tuple[Level, ...], motion: np.ndarray, config: RgbdConfig,
     level: int = 0,
-) -> tuple[tuple[Level, ...], tuple[Level, ...]]:
-    """Both pyramids as one exposure would show them; themselves where they hardly differ.
+) -> tuple[tuple[Level, ...], tuple[Level, ...], Exposure]:
+    """Both pyramids as one exposure shows them, themselves where they hardly differ, and what was undone.
 
-    What a motion (4, 4) leads onto each other is compared, at one level. Intensities become those of the
-    source, both cut off at what either exposure can show.
+    What a motion (4, 4) leads onto each other is compared, at one level.
     """
     gain, offset, change = between(source[level], target[level], motion)
     if change <= config.images.max_exposure_change:
-        return source, target
-    low, high = max(0.0, -offset / gain), min(1.0, (1.0 - offset) / gain)
-
-    def as_source(levels: tuple[Level, ...], intensity: np.ndarray) -> tuple[Level, ...]:
-        return pyramid.with_intensity(levels, np.clip(intensity, low, high).astype(np.float32), config.images)
-
-    return (as_source(source, source[0].packed[..., 0]),
-            as_source(target, (target[0].packed[..., 0] - offset) / gain))
+        return source, target, Exposure()
+    undone = Exposure(gain, offset)
+    shown = undone.undone(source[0].packed[..., 0], target[0].packed[..., 0])
+    return *(pyramid.with_intensity(levels, intensity, config.images)
+             for levels, intensity in zip((source, target), shown, strict=True)), undone
 
 
 def between(source: Level, target: Level, motion: np.ndarray) -> tuple[float, float, float]:

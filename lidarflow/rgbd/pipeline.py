@@ -78,13 +78,13 @@ def _estimate(
     nothing_moves = np.zeros(len(clusters.centres))
     images = source, target
     with timed("exposure"):     # where pixels are large, the motion between two frames is small
-        source, target = exposure.matched(*images, np.eye(4), config, min(2, len(source) - 1))
+        source, target, undone = exposure.matched(*images, np.eye(4), config, min(2, len(source) - 1))
     with timed("robust odometry"):
         static = robust = odometry.robust(
             source, target, clusters, nothing_moves if b_before is None else b_before, config)
     if source is not images[0]:
         with timed("exposure"):
-            source, target = exposure.matched(*images, robust, config)
+            source, target, undone = exposure.matched(*images, robust, config)
     b, motions = nothing_moves, np.tile(static, (len(nothing_moves), 1, 1))
     if config.segmentation.enabled:
         with timed("segmentation"):
@@ -107,4 +107,4 @@ def _estimate(
         is_dynamic = np.append(b > config.segmentation.moving_above, False)[label]
     return RgbdResult(
         flow, source[0].points, label >= 0, label, b, motions, static, is_dynamic, source[0].camera,
-        clusters.centres, timed.seconds)
+        clusters.centres, timed.seconds, undone)
