@@ -14,7 +14,8 @@ def export(
     run_dir: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="A run folder.")],
     name: Annotated[str, typer.Option("--format", help=f"One of {_FORMATS}.")],
     out: Annotated[Path | None, typer.Option(
-        "--out", help="Folder, or .txt file for poses; RUN_DIR-FORMAT if not given.")] = None,
+        "--out", help="Folder, for poses (kitti, kitti-camera, tum) also a .txt file; RUN_DIR-FORMAT if not "
+        "given.")] = None,
     data: Annotated[Path | None, typer.Option(help="Where the run's data are now, if they moved.")] = None,
     masks: Annotated[Path | None, typer.Option(
         help="For av2-v1, the challenge's .zip of masks: write only what it counts.")] = None,

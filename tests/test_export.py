@@ -219,7 +219,7 @@ def test_the_same_run_gives_the_same_bytes(run, tmp_path, name):
 def test_the_help_names_every_format(lidarflow):
     said = " ".join(lidarflow.ok("export", "--help").split())
     assert f"One of {', '.join(export.FORMATS)}." in said.replace(" │ │ ", " ")
-    assert set(export.POSE_FORMATS) < export.FORMATS.keys()
+    assert set(export.POSE_FILES) < export.FORMATS.keys()
 
 
 @pytest.mark.parametrize("name, said", [
@@ -236,8 +236,11 @@ def test_what_is_no_finished_run(lidarflow, run, tmp_path):
     assert "out.txt: is a file; expected a folder" in complaint_of_file(lidarflow, tmp_path)
     assert "--out run: is the run itself" in lidarflow.complaint(
         "export", "run", "--format", "ply", "--out", "run")
-    assert "expected a file name ending in .txt" in lidarflow.complaint(
-        "export", "run", "--format", "tum", "--out", "poses")
+    assert "--out run: is the run itself" in lidarflow.complaint(
+        "export", "run", "--format", "kitti", "--out", "run")
+    (tmp_path / "poses.csv").touch()
+    assert "poses.csv: is a file; expected a folder, or a file name ending in .txt" in lidarflow.complaint(
+        "export", "run", "--format", "tum", "--out", "poses.csv")
     (run / "flow" / "000000.npz").unlink()
     assert "1 flow files for 2 pairs; was the run cut short?" in lidarflow.complaint(
         "export", "run", "--format", "ply")
@@ -245,6 +248,18 @@ def test_what_is_no_finished_run(lidarflow, run, tmp_path):
     assert "run: no poses_tum.txt; was the run cut short?" in lidarflow.complaint(
         "export", "run", "--format", "tum")
     assert not (tmp_path / "run-ply").exists() and not rests(tmp_path)
+
+
+@pytest.mark.parametrize("name, file", [("kitti", "poses_kitti.txt"), ("tum", "poses_tum.txt")])
+def test_poses_go_into_a_folder_or_into_a_file(lidarflow, run, tmp_path, name, file):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "dotted.txt").mkdir()
+    lidarflow.ok("export", "run", "--format", name)
+    expected = (tmp_path / f"run-{name}.txt").read_bytes()
+    for out, place in (("there", f"there/{file}"), ("new/deep", f"new/deep/{file}"),
+                       ("dotted.txt", f"dotted.txt/{file}"), ("mine.txt", "mine.txt")):
+        assert f"written    {place}" in lidarflow.ok("export", "run", "--format", name, "--out", out)
+        assert (tmp_path / place).read_bytes() == expected != b""
 
 
 def complaint_of_file(lidarflow, folder):

@@ -24,7 +24,8 @@ FORMATS = {
     "kitti-camera": "lidarflow.export.poses:write_kitti_camera",
     "tum": "lidarflow.export.poses:write_tum",
 }
-POSE_FORMATS = ("kitti", "kitti-camera", "tum")     # one text file; all others fill a folder
+# one text file, called so in a folder; all others fill a folder
+POSE_FILES = {"kitti": "poses_kitti.txt", "kitti-camera": "poses_kitti_camera.txt", "tum": "poses_tum.txt"}
 MASKED_FORMATS = ("av2-v1",)                       # what may be limited to the points that a challenge counts
 
 
@@ -33,7 +34,7 @@ def export(
 ) -> Iterator[Path]:
     """Write a run in the format called `name`; yields every file once all of its kind are complete.
 
-    out    a folder, or a .txt file for poses; beside the run if not given
+    out    a folder, made where there is none; for poses also a .txt file; beside the run if not given
     data   where the run's data set is now, if not where it was
     masks  for MASKED_FORMATS, the archive that says which sweeps and points to write
 
@@ -48,12 +49,16 @@ def export(
         write = functools.partial(write, masks=Path(masks))
     run_dir = Path(run_dir)
     out = default_out(run_dir, name) if out is None else Path(out)
-    if name in POSE_FORMATS:
+    is_poses = name in POSE_FILES
+    if out.exists() and run_dir.exists() and out.samefile(run_dir):
+        raise DataError(f"--out {out}: is the run itself; choose another folder")
+    if is_poses and not out.is_file() and (out.is_dir() or out.suffix != ".txt"):
+        out = out / POSE_FILES[name]
+    if is_poses and out.suffix == ".txt":
         check_output("--out", out, ".txt")
     elif out.exists() and not out.is_dir():
-        raise DataError(f"--out {out}: is a file; expected a folder")
-    elif out.exists() and run_dir.exists() and out.samefile(run_dir):
-        raise DataError(f"--out {out}: is the run itself; choose another folder")
+        also = ", or a file name ending in .txt" if is_poses else ""
+        raise DataError(f"--out {out}: is a file; expected a folder{also}")
     yield from write(FinishedRun.read(run_dir, data), out)
 
 
@@ -72,4 +77,4 @@ def default_out(run_dir: Path, name: str) -> Path:
     place = run_dir.resolve()
     if place.parent == place:
         raise DataError(f"{run_dir}: is no run folder; expected a folder that 'lidarflow run' wrote")
-    return run_dir.parent / f"{place.name}-{name}{'.txt' if name in POSE_FORMATS else ''}"
+    return run_dir.parent / f"{place.name}-{name}{'.txt' if name in POSE_FILES else ''}"
