@@ -121,9 +121,11 @@ def test_a_flow_file_is_scored_against_a_truth_file(lidarflow, data, run, tmp_pa
 
 
 def test_poses_alone_make_a_static_scene(lidarflow, data, run):
+    assert "false" in lidarflow.ok("eval", "run")
     shutil.rmtree(truth_folder(data))
     out = lidarflow.ok("eval", "run")
     assert "truth      poses (every point taken as static)" in out
+    assert "false" not in out, "poses do not say what moves"
     mean = metrics_of(run)["mean"]
     assert mean["epe_static_m"] > 1.05 * OFF_M, "movers count as static"
     assert "epe_dynamic_m" not in mean

@@ -73,6 +73,17 @@ def test_without_movers_their_scores_are_nan_and_the_rest_stays():
     assert (three_way.missed_movers, three_way.false_movers) == (0, 2), "the flow has a length, labels decide"
 
 
+def test_poses_alone_do_not_say_which_points_move():
+    """A point that is called moving is not wrong for that; its flow is scored as before."""
+    points, result, truth = eight_rows()
+    nothing = replace(truth, is_dynamic=np.zeros(8, bool))
+    of_poses = metrics.score(points, result, replace(nothing, origin=metrics.POSES_ONLY))
+    of_labels = metrics.score(points, result, nothing)
+    assert of_labels.false_movers == pytest.approx(2 / 6) and of_labels.three_way.dynamic_iou == 0.0
+    assert np.isnan([of_poses.false_movers, of_poses.movers_found, of_poses.three_way.dynamic_iou]).all()
+    assert of_poses.static == of_labels.static and of_poses.all == of_labels.all
+
+
 def test_a_truth_that_knows_nothing_gives_nan_everywhere():
     points, result, truth = eight_rows()
     scores = metrics.score(points, result, replace(truth, valid=np.zeros(8, bool)))

@@ -12,7 +12,7 @@ from rich.table import Table as RichTable
 
 from lidarflow import __version__, score_tables
 from lidarflow.config import Config
-from lidarflow.metrics import POSES_ONLY, Interval
+from lidarflow.metrics import Interval
 from lidarflow.report import plots
 from lidarflow.report.reading import Run, SeenObject
 from lidarflow.settings import describe, to_dict
@@ -21,7 +21,6 @@ from lidarflow.tables import run_notes, run_table
 _MOST_PAIR_ROWS, _MOST_OBJECT_ROWS = 60, 25
 _LOW, _HIGH = -1, 1
 _OF_WHOLE_GRAPH = {"t_e_m", "r_e_rad"}
-_OF_MOVERS = {"dynamic_iou", "false_movers"}
 # name in metrics.json: (what people call it, factor, digits, which way is better). All are means of the
 # figures of pairs; "of a pair" tells them from what other tables have of the points of all pairs.
 _FIGURES = {
@@ -122,10 +121,9 @@ def _mean(run: Run, figure: str) -> float:
     """A figure's mean over pairs; NaN where it is not known, or would mislead.
 
     The paper's errors are of the points in the graph, so they mean little where the graph holds only what is
-    near moving objects; an overlap with movers says nothing where the truth knows of none.
+    near moving objects.
     """
-    unfit = (figure in _OF_WHOLE_GRAPH and run.config.objects.enabled) or (
-        figure in _OF_MOVERS and run.truth == POSES_ONLY)
+    unfit = figure in _OF_WHOLE_GRAPH and run.config.objects.enabled
     return np.nan if unfit else run.mean.get(figure, np.nan)
 
 
