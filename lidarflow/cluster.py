@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarflow import io, methods
+from lidarflow import first_use, io, methods
 from lidarflow.checkpoints import (
     Checkpoints,
     Numbers,
@@ -88,6 +88,8 @@ def explain_chunk(source: Source, chunk: Chunk, config: Config, method: str, ski
     pinned  keep to one core, that of the worker's number, for libraries that take as many as there are
     """
     _use_one_thread(pinned)
+    if pinned:     # on this machine, where the command has told
+        first_use.is_known()
     dataset = open_dataset(source.folder, source.loader, source.sequence, source.kitti_correction)
     estimator = methods.find(method).along(config)
     _let_see(estimator, dataset, range(chunk.seen, chunk.begin))

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarflow import pose
+from lidarflow import first_use, pose
 from lidarflow.aside import Aside
 from lidarflow.config import Config, given
 from lidarflow.datasets import Dataset
@@ -80,6 +80,7 @@ def estimate_flow(
     Scans without times are taken 0.1 s apart. Raises DataError for scans that cannot be used.
     """
     scans, config = as_pair(pair), given(config, Config)
+    first_use.announce()
     with Aside() as beside:
         result, _ = explain(prepare(scans, config, beside), config, beside)
     return result
@@ -107,6 +108,7 @@ class FlowEstimator:
         one starts anew, as the first. An array of another shape is no scan, and changes nothing.
         """
         scan = as_scan(scan)
+        first_use.announce()
         try:
             return self._step(scan)
         except BaseException:     # the scan is nobody's source, and no pair may inherit half of another

@@ -110,6 +110,7 @@ def _compute(dataset: "Dataset", frames: list[int], settings: "Config", out: Pat
     from lidarflow import cluster, runner
 
     chunks = cluster.chunks_of(frames, spread.chunk, settings)
+    announce_first_use()
     with cluster.connected(spread.workers, spread.scheduler) as client, progress(
             "scan pairs computed", len(frames) - 1) as bar:
         kept = runner.begin(dataset, frames, settings, out, method, going)

@@ -92,12 +92,12 @@ def notes_of(stop: BaseException | None) -> list[str]:
 
 
 def announce_first_use() -> None:
-    """A line on a terminal's standard error where kernels have not been compiled on this machine yet."""
-    from lidarflow.kernels.compiled import are_cached
+    """A line on standard error where kernels have not been compiled on this machine yet."""
+    from functools import partial
 
-    on = console(sys.stderr)
-    if on.is_terminal and not are_cached():
-        on.print("first use: compiling for this machine takes one to four minutes; later starts skip it")
+    from lidarflow import first_use
+
+    first_use.announce(partial(console(sys.stderr).print, soft_wrap=True))
 
 
 def check_live_view(wanted: bool) -> None:

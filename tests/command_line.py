@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cloud_files import write_bin
 
-from lidarflow import cli, synthetic
+from lidarflow import cli, first_use, synthetic
 
 
 @functools.cache
@@ -39,6 +39,7 @@ class Program:
         for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
             monkeypatch.delenv(name, raising=False)
         monkeypatch.setenv("COLUMNS", "80")
+        first_use.is_known()     # the first test on a machine compiles
 
     def __call__(self, *words):
         """(exit code, stdout, stderr) of `lidarflow WORDS`."""

@@ -11,7 +11,7 @@ LAYERS = [
     {"errors", "__version__"},
     {"aside", "open3d_import", "pose", "robust", "rows", "colour", "interrupts", "kernels", "silence",
      "stopwatch"},
-    {"checks", "rgbd_colour"},    # they use pose, and colour
+    {"checks", "rgbd_colour", "first_use"},    # they use pose, colour, and kernels
     {"types", "rgbd_types"},
     {"settings"},
     {"config"},

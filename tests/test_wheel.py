@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from shared_data import ROOT
 
-from lidarflow import __version__
+from lidarflow import __version__, first_use
 
 pytestmark = pytest.mark.slow
 
@@ -101,7 +101,7 @@ def test_the_installed_program_answers(lidarflow, tmp_path):
 
 def test_the_demo_runs_in_an_empty_folder_without_a_display(lidarflow, tmp_path):
     done = ran(lidarflow, "demo", cwd=tmp_path, timeout_s=600)
-    assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
+    assert (done.returncode, done.stderr) == (0, first_use.LINE + "\n"), done.stdout + done.stderr
     run = tmp_path / "demo" / "run"
     assert {file.name for file in tmp_path.iterdir()} == {"demo"}
     assert {file.name for file in run.iterdir()} == RUN_FILES

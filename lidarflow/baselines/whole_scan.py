@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from lidarflow import pose
+from lidarflow import first_use, pose
 from lidarflow.config import Config, given
 from lidarflow.lidar import features, preparation
 from lidarflow.lidar.features import Masks
@@ -64,6 +64,7 @@ class WholeScan(ABC):
     def step(self, scan: Scan) -> FlowResult | None:
         """Flow from the last scan to this one; None for the first, and for one after a scan of no use."""
         previous, self._previous = self._previous, None
+        first_use.announce()
         preparation.require_points(scan, self.config.preparation)
         prepared = self._prepare(scan)
         result = None

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from lidarflow import first_use
 from lidarflow.config import given
 from lidarflow.kernels import cluster_images
 from lidarflow.rgbd import clusters as geometric
@@ -21,6 +22,7 @@ def estimate_flow(
     """
     check_is("pair", pair, RgbdPair)
     config = given(config, RgbdConfig)
+    first_use.announce()
     timed = Stopwatch()
     with timed("pyramid"):
         source, target = (pyramid.build(frame, pair.camera, config.images)
@@ -50,6 +52,7 @@ class RgbdEstimator:
 
     def step(self, frame: RgbdFrame) -> RgbdResult | None:
         """Result of the pair of the last frame and this one; None for the first. Raises as estimate_flow."""
+        first_use.announce()
         timed = Stopwatch()
         # Forgotten first: after a frame that cannot be used, the next pair must not inherit an older one's.
         source, self._levels = self._levels, None
