@@ -110,7 +110,7 @@ def packed(pair: ScanPair, result: FlowResult, tracks: Tracks, stretch: Stretch)
         "track_points": np.concatenate([np.empty((0, 3)), *(track.points for track in tracks.followed)]),
         # Infinite and unknown numbers have to survive, which is why this is Python's own kind of JSON.
         "notes": np.array(json.dumps({"stats": asdict(result.stats), "seconds": result.seconds,
-                                      "next_id": tracks.next_id}))}
+                                      "doubt": result.doubt, "next_id": tracks.next_id}))}
     for name, shape in _OF_OBJECTS.items():
         arrays[f"object_{name}"] = np.array(
             [getattr(found, name) for found in result.objects], float).reshape(-1, *shape)
@@ -129,7 +129,8 @@ def unpacked(file: Path, pair: ScanPair) -> tuple[FlowResult, Tracks]:
             flow=arrays["flow"] if len(arrays["flow"]) else pose.apply(motions, pair.source.points)
             - pair.source.points,
             motions=motions, stats=SolveStats(**notes["stats"]), seconds=notes["seconds"],
-            objects=_objects(arrays), **{name: arrays[name] for name in _PLAIN})
+            objects=_objects(arrays), doubt=str(notes["doubt"]),
+            **{name: arrays[name] for name in _PLAIN})
         return result, Tracks(_tracks(arrays), notes["next_id"])
 
 

@@ -20,6 +20,7 @@ class PairReport:
 
     matches      None where only the flow file is left, which does not hold them
     valid_share  how many of the points have a motion that rests on evidence
+    doubt        why the scan is hardly what the method expects, "" where it may be
     """
 
     frame: str
@@ -34,6 +35,7 @@ class PairReport:
     stats: SolveStats
     seconds: dict[str, float]
     valid_share: float = float("nan")
+    doubt: str = ""
 
 
 def report_pair(
@@ -63,6 +65,7 @@ def report_result(
         stats=result.stats,
         seconds=result.seconds,
         valid_share=metrics.mean_of(result.valid[np.isfinite(source.points).all(axis=1)]),
+        doubt=result.doubt,
     )
 
 
@@ -156,7 +159,7 @@ def _over_pairs(reports: list[PairReport]) -> dict[str, tuple[float, float]]:
 
 def _plain_pair(report: PairReport) -> dict:
     values = asdict(report)
-    del values["seconds"]
+    del values["seconds"], values["doubt"]
     if values["scores"] is not None:
         del values["scores"]["buckets"]     # sums to be pooled, nothing to be read
     return values

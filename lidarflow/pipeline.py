@@ -24,6 +24,7 @@ from lidarflow.lidar import (
     preparation,
     refinement,
     start,
+    upright,
 )
 from lidarflow.lidar import uncertainty as uncertainties
 from lidarflow.lidar.attribution import WORLD, Attribution, Search
@@ -300,9 +301,10 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
         valid = source.ground | found.explained | is_solved
         object_id = np.append(found.ids, np.int32(-1)).take(found.owner)
         std_m[~valid] = np.nan
+        doubt = upright.doubt(points, source.thinned.planes.normals)
     result = FlowResult(
         flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,
-        object_id, found.objects, std_m)
+        object_id, found.objects, std_m, doubt)
     return result, found.tracks
 
 

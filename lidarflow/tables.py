@@ -83,7 +83,14 @@ def run_notes(reports: list[PairReport], config: Config) -> list[str]:
     for report in reports:
         doubt = _doubt(report.matches, report.seconds, report.alignment)
         notes += [f"{report.frame}: {doubt}"] if doubt else []
-    return notes
+    return notes + _of_scans(reports)
+
+
+def _of_scans(reports: list[PairReport]) -> list[str]:
+    """What makes the scans themselves doubtful, as said of the first; no line where none are."""
+    doubtful = [report for report in reports if report.doubt]
+    others = f" and {len(doubtful) - 1} more of {len(reports)} scans" if doubtful[1:] else ""
+    return [f"{report.frame}{others}: {report.doubt}" for report in doubtful[:1]]
 
 
 def compare_table(found: Comparison) -> Table:
@@ -158,8 +165,8 @@ def pair_table(pair: ScanPair, result: FlowResult, alignment: Alignment) -> Tabl
     if odd_sizes:
         table.add_row("note", f"the scans have {counts[0]} and {counts[1]} points; are both of one sensor?")
     doubt = _doubt(len(result.match_source), result.seconds, alignment)
-    if doubt:
-        table.add_row("note", doubt)
+    for line in filter(None, (doubt, result.doubt)):
+        table.add_row("note", line)
     table.add_row("seconds", ", ".join(f"{stage} {s:.1f}" for stage, s in result.seconds.items()))
     return table
 

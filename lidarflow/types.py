@@ -293,6 +293,7 @@ class FlowResult:
     object_id    (N,) int32          the moving object the point is on, -1 = none (the default)
     objects      tuple               the moving objects; in a sequence their ids are kept over time
     std_m        (N,) float64        standard deviation of the flow, metres, over all axes; NaN = unknown
+    doubt        str                 why the source is hardly what the method expects, "" where it may be
     """
 
     flow: np.ndarray
@@ -309,6 +310,7 @@ class FlowResult:
     object_id: np.ndarray = _FILLED_IN
     objects: tuple[MovingObject, ...] = ()
     std_m: np.ndarray = _FILLED_IN
+    doubt: str = ""
 
     def __post_init__(self):
         check("FlowResult.flow", self.flow, (None, 3), "f")

@@ -9,7 +9,7 @@ import numpy as np
 
 # What JSON cannot say: null is infinite here, unknown everywhere else.
 _INFINITE = {"high_m"}
-_NOT_WRITTEN = {"seconds": dict, "buckets": type(None)}
+_NOT_WRITTEN = {"seconds": dict, "doubt": str, "buckets": type(None)}
 
 
 def rebuilt(kind: Any, value: Any, name: str) -> Any:
