@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import typer
@@ -151,7 +152,7 @@ def pair(
     print(f"method     {method}")
     say_what_is_idle((method,), settings, along=False)
     print(f"flow       {out}")
-    print(f"look at it with: lidarflow view {out} --target {target}")
+    print(f"look at it with: lidarflow view {quote(str(out))} --target {quote(str(target))}")
 
 
 @app.command()
@@ -283,7 +284,8 @@ def view(
         print(f"recording  {save}")
     else:
         rgbd_io.load_flow(what) if rgbd_io.is_rgbd_flow(what) else flow_files.load_flow(what)
-        rerun_streams.require_display(f"make a recording with: lidarflow view {what} --save FILE.rrd")
+        instead = f"lidarflow view {quote(str(what))} --save FILE.rrd"
+        rerun_streams.require_display(f"make a recording with: {instead}")
         with tempfile.TemporaryDirectory() as folder:
             recording = Path(folder) / "flow.rrd"
             _record_flow_file(what, target, recording)

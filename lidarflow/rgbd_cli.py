@@ -5,6 +5,7 @@ Heavy packages are imported inside the commands, so that --help answers at once.
 
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -85,7 +86,7 @@ def pair(
     print(f"camera     {origin}")
     show(pair_table(frames, result, report))
     print(f"flow       {out}")
-    print(f"look at it with: lidarflow view {out}")
+    print(f"look at it with: lidarflow view {quote(str(out))}")
 
 
 @app.command()

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -213,7 +214,7 @@ def where_results_are(out: Path, is_recorded: bool) -> list[str]:
     told = [f"results    {out}", f"metrics    {out / 'metrics.json'}",
             f"picture    {out / 'preview.png'}   (the last pair)"]
     if is_recorded:
-        told += [f"recording  {out / 'recording.rrd'}", f"look at it with: lidarflow view {out}"]
+        told += [f"recording  {out / 'recording.rrd'}", f"look at it with: lidarflow view {quote(str(out))}"]
     return told
 
 

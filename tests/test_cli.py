@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -403,6 +404,9 @@ def test_without_a_display_the_way_out_is_named(lidarflow, finished, scans, tmp_
     flow_file, out = finished[0] / "flow" / "000000.npz", tmp_path / "out"
     assert f"rerun --web-viewer {finished[0] / 'recording.rrd'}" in lidarflow.complaint("view", finished[0])
     assert f"lidarflow view {flow_file} --save" in lidarflow.complaint("view", flow_file)
+    spaced = tmp_path.with_name("my flow.npz")
+    shutil.copyfile(flow_file, spaced)
+    assert f"lidarflow view '{spaced}' --save" in lidarflow.complaint("view", spaced)
     for words in (("run", scans[0].parent), ("pair", *scans[:2])):
         suffix = ".npz" if words[0] == "pair" else ""
         assert "display" in lidarflow.complaint(*words, "--visualize", "--out", f"{out}{suffix}")
