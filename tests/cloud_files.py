@@ -72,8 +72,20 @@ def write_text(file, points=POINTS):
     return file
 
 
+def write_csv(file, points=POINTS):
+    file.write_text("".join(f"{x},{y},{z},9\n" for x, y, z in points))
+    return file
+
+
+def write_named_csv(file, points=POINTS):
+    file.write_text("time,Z,intensity,x,y\n" + "".join(f"12:0{k},{z},9,{x},{y}\n"
+                                                       for k, (x, y, z) in enumerate(points)))
+    return file
+
+
 WRITERS = {
     "a.bin": write_bin, "a.npy": write_numpy, "a.npz": write_numpy, "a.xyz": write_text, "a.txt": write_text,
+    "a.csv": write_csv, "named.csv": write_named_csv,
     "ascii.pcd": lambda f: write_pcd(f, "ascii"), "binary.pcd": lambda f: write_pcd(f, "binary"),
     "packed.PCD": lambda f: write_pcd(f, "binary_compressed"), "ascii.ply": lambda f: write_ply(f, "ascii"),
     "little.ply": lambda f: write_ply(f, "binary_little_endian"),

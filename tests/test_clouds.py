@@ -2,9 +2,21 @@
 
 import numpy as np
 import pytest
-from cloud_files import NAN, POINTS, WRITERS, message, write_bin, write_numpy, write_pcd, write_ply
+from cloud_files import (
+    NAN,
+    POINTS,
+    WRITERS,
+    message,
+    write_bin,
+    write_csv,
+    write_named_csv,
+    write_numpy,
+    write_pcd,
+    write_ply,
+)
+from command_line import drive
 
-from lidarflow.datasets import read_points, read_scan
+from lidarflow.datasets import guess_loader, open_dataset, read_points, read_scan
 from lidarflow.datasets.kitti_correction import correct_vertical_angle
 
 
@@ -78,18 +90,18 @@ def test_files_of_nuscenes_have_five_numbers_a_point(tmp_path):
     assert "48 bytes are not a multiple of 20" in message(read_points, tmp_path / "c.pcd.bin")
 
 
-@pytest.mark.parametrize("suffix", [".bin", ".pcd", ".ply", ".npy", ".npz", ".xyz"])
+@pytest.mark.parametrize("suffix", [".bin", ".pcd", ".ply", ".npy", ".npz", ".xyz", ".csv"])
 def test_empty_file(tmp_path, suffix):
     file = tmp_path / f"a{suffix}"
     file.touch()
     assert "empty file (0 bytes)" in message(read_points, file)
 
 
-@pytest.mark.parametrize("name", ["a.npy", "a.xyz", "a.npz"])
+@pytest.mark.parametrize("name", ["a.npy", "a.xyz", "a.npz", "a.csv", "b.csv"])
 def test_a_cloud_without_points(tmp_path, name):
     file = tmp_path / name
-    if name == "a.xyz":
-        file.write_text("# nothing\n")
+    if file.suffix in (".xyz", ".csv"):
+        file.write_text("x,y,z\n" if name == "b.csv" else "# nothing\n")
     else:
         write_numpy(file, POINTS[:0])
     assert "empty scan (0 points)" in message(read_points, file)
@@ -199,6 +211,68 @@ def test_damaged_ply(tmp_path, old, new, found):
     assert found in message(read_points, file)
 
 
+# --- tables of commas ---
+
+ROWS = "1,2,3,0.5\n4.5,-5,6.25,1\n"
+READ = np.array([[1.0, 2.0, 3.0], [4.5, -5.0, 6.25]])
+
+
+@pytest.mark.parametrize("text", [
+    ROWS, "# made by hand\n" + ROWS, "x,y,z,intensity\n" + ROWS, "X, Y ,Z,i\n" + ROWS, "# x,y,z,i\n" + ROWS,
+    ROWS.replace("\n", "\r\n"), "//X,Y,Z,I\n" + ROWS, '\ufeff"x","y","z","i"\n' + ROWS,
+    "\n\nx,y,z,i\n\n" + ROWS,
+    "z,n,x,y\n3,a,1,2\n6.25,b,4.5,-5\n", 'name,x,y,z\n"a, b",1,2,3\n"c",4.5,-5,6.25\n',
+    ",x,y,z\n0,1,2,3\n1,4.5,-5,6.25\n", ROWS.replace(",", ", "),
+    "x,y,z,colour\n1,2,3,#ff0000\n4.5,-5,6.25,#0\n",
+])
+def test_tables_of_commas_are_read_by_name_or_by_place(tmp_path, text):
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    np.testing.assert_array_equal(read_scan(tmp_path / "a.csv").points, READ)
+
+
+def test_what_is_not_finite_in_a_table_is_a_row_of_its_own(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n1,nan,3\n1,2,-inf\n")
+    np.testing.assert_array_equal(read_points(tmp_path / "a.csv"), [[1, 2, 3], [NAN] * 3, [NAN] * 3])
+
+
+@pytest.mark.parametrize("text, found", [
+    ("a,b,c\n1,2,3\n", "its first line says a, b, c; expected numbers, or names of columns with x, y and z"),
+    ("x;y;z\n1;2;3\n", "its first line says x;y;z; expected"),
+    ("frame,x,y\n0,1,2\n", "x, y and z among them"),
+    ("x,y,z,x\n1,2,3,4\n", "has 2 columns x; expected one of each name"),
+    ("x,y,z,i\n1,2,3,4\n1,2,3\n", "row 2 has 3 columns, but the first line names 4; the file is truncated"),
+    ("x,y,z\n1,2,\n", "expected rows of numbers x y z (could not convert string '' to float64"),
+    ("x,y,z\n1,two,3\n", "expected rows of numbers x y z (could not convert string 'two'"),
+    ("1,2,3\n1,two,3\n", "expected rows of numbers x y z (could not convert string 'two'"),
+    ("1,2,3\n1,2\n", "expected rows of numbers x y z (the number of columns changed from 3 to 2"),
+    ("1,2,3,4\n4,,5,6\n", "expected rows of numbers x y z (could not convert string ''"),
+    ("1,,2,3\n4,,5,6\n", "its first line says 1, , 2, 3; expected numbers"),
+    ("1,2\n3,4\n", "an array (2, 2) of float64; expected numbers (N, 3) or wider"),
+    (",".join("1" * 40) + "\n" + ",".join("2" * 40) + "\n", "this looks transposed"),
+])
+def test_damaged_tables(tmp_path, text, found):
+    (tmp_path / "a.csv").write_text(text)
+    assert found in message(read_points, tmp_path / "a.csv")
+
+
+def test_a_table_that_is_no_text(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"\xff\xfe1,2,3\n")
+    assert "expected rows of numbers x y z ('utf-8' codec" in message(read_points, tmp_path / "a.csv")
+
+
+def test_tables_are_scans_where_there_are_no_others(tmp_path):
+    for k in range(3):
+        (tmp_path / f"{k}.csv").write_text(ROWS)
+    (tmp_path / "boxes.csv").write_text("frame,track\n")
+    data = open_dataset(tmp_path)
+    assert data.loader == "folder" and [data.scan(k).name for k in range(len(data))] == ["0", "1", "2"]
+    write_bin(tmp_path / "0.bin")
+    assert [file.name for file in open_dataset(tmp_path).files] == ["0.bin"]
+    (tmp_path / "0.bin").unlink()
+    (tmp_path / "a.bag").touch()
+    assert guess_loader(tmp_path) == "rosbag"
+
+
 # --- the KITTI correction ---
 
 def test_correction_raises_by_205_thousandths_of_a_degree_and_keeps_rows():
@@ -228,3 +302,15 @@ def test_a_single_bin_is_corrected_where_kitti_puts_it(tmp_path):
     np.testing.assert_allclose(read_scan(inside, "off").points, POINTS)
     np.testing.assert_allclose(read_scan(outside, "on").points, raised)
     assert read_scan(inside).name == "7"
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_tables_of_commas_give_the_flow_of_any_other_cloud(lidarflow, tmp_path, named):
+    write = write_named_csv if named else write_csv
+    for k, (scan, _) in enumerate(drive()[:2]):
+        write_numpy(tmp_path / f"{k}.npy", scan.points)
+        write(tmp_path / f"{k}.csv", scan.points.astype(np.float32))
+    for kind in ("npy", "csv"):
+        lidarflow.ok("pair", tmp_path / f"0.{kind}", tmp_path / f"1.{kind}", "--method", "zero",
+                     "--out", tmp_path / kind / "flow.npz")
+    assert (tmp_path / "npy" / "flow.npz").read_bytes() == (tmp_path / "csv" / "flow.npz").read_bytes()

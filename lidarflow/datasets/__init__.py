@@ -78,7 +78,7 @@ def guess_loader(folder: Path) -> str:
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder")
     root = _data_root(folder)
-    suffixes = {file.suffix.lower() for file in clouds.visible_files(root)}
+    files = clouds.visible_files(root)
     if kitti.sequence_folders(root) or ((root / "velodyne").is_dir() and (root / "calib.txt").is_file()):
         return "kitti"
     if kitti_tracking.is_sequence(root) or kitti_tracking.sequence_folders(root):
@@ -91,7 +91,8 @@ def guess_loader(folder: Path) -> str:
         return "nuscenes"
     if (root / "img.cfg").is_file() and range_images.list_images(root):
         return "range_images"
-    if suffixes.isdisjoint(clouds.FOLDER_SUFFIXES):
+    if clouds.kinds_of(files) in ([], [".csv"]):     # of a recording there may be tables
+        suffixes = {file.suffix.lower() for file in files}
         if suffixes & {".bag", ".db3"} or (".mcap" in suffixes and (root / "metadata.yaml").is_file()):
             return "rosbag"
         clouds.list_clouds(root)     # says what was found instead

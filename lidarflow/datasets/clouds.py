@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,8 @@ KITTI_POINT_BYTES, NUSCENES_POINT_BYTES = 16, 20
 _MOST_REFLECTANCE = 65535     # 0 to 1, to 255 or to 16 bits, as the sensor has it
 _ODD_SHARE = 0.01     # of reflectances, which may be damaged; of coordinates, far more are negative
 _MOST_FIELDS = 32     # more than a sensor tells of a point
+_MOST_QUOTED = 60     # characters of a line that is no header
+_TABLES = ("boxes.csv", "objects.csv")     # of what is labelled, and found: no clouds
 
 
 def read_points(path: Path) -> np.ndarray:
@@ -79,7 +82,7 @@ def list_clouds(folder: Path) -> list[Path]:
     """The cloud files of a folder in natural order; DataError unless there are some of just one kind."""
     files = visible_files(folder)
     found = Counter(file.suffix.lower() for file in files)
-    kinds = [suffix for suffix in FOLDER_SUFFIXES if found[suffix]]
+    kinds = kinds_of(files)
     if not kinds:
         raise DataError(f"{folder}: no {'/'.join(FOLDER_SUFFIXES)} files ({_found(folder, found)}); "
                         "is this the 'velodyne' folder?")
@@ -87,7 +90,18 @@ def list_clouds(folder: Path) -> list[Path]:
         counts = " and ".join(f"{found[kind]} {kind}" for kind in kinds)
         raise DataError(f"{folder}: found {counts} files; expected scans of one kind, "
                         "move the others out of this folder")
-    return natural_sorted(file for file in files if file.suffix.lower() == kinds[0])
+    return natural_sorted(file for file in files if _kind(file) == kinds[0])
+
+
+def kinds_of(files: Sequence[Path]) -> list[str]:
+    """The suffixes of cloud files among `files`; .csv, as tables beside them have, if there is no other."""
+    found = {_kind(file) for file in files}
+    kinds = [suffix for suffix in FOLDER_SUFFIXES if suffix in found]
+    return [kind for kind in kinds if kind != ".csv"] or kinds
+
+
+def _kind(file: Path) -> str:
+    return "" if file.name in _TABLES else file.suffix.lower()
 
 
 def visible_files(folder: Path) -> list[Path]:
@@ -232,14 +246,58 @@ def _read_npz(path: Path) -> np.ndarray:
 
 
 def _read_text(path: Path) -> np.ndarray:
+    return _rows(path, [line.replace(",", " ") for line in _lines(path)])
+
+
+def _read_csv(path: Path) -> np.ndarray:
+    """Columns x, y and z by name where a first line has names, else the first three."""
+    lines = [line for line in _lines(path) if line.strip()]
+    names = [word.strip().strip('"').strip().lower() for word in (lines or [""])[0].lstrip("#/ ").split(",")]
+    if {"x", "y", "z"} <= set(names):
+        return _named_columns(path, lines[1:], names)
+    if lines and not lines[0].lstrip().startswith("#") and not all(map(_is_number, names)):
+        raise DataError(f"{path}: its first line says {', '.join(names)[:_MOST_QUOTED]}; expected numbers, "
+                        "or names of columns with x, y and z among them")
+    return _rows(path, lines, delimiter=",")     # an empty cell is no blank: what follows keeps its place
+
+
+def _named_columns(path: Path, lines: list[str], names: list[str]) -> np.ndarray:
+    """Points (N, 3) of `lines` with a column for each of the names; other columns may hold anything."""
+    twice = [axis for axis in "xyz" if names.count(axis) > 1]
+    if twice:
+        raise DataError(f"{path}: has {names.count(twice[0])} columns {twice[0]}; expected one of each name")
+    for number, line in enumerate(lines, 1):
+        if '"' not in line and line.count(",") != len(names) - 1:     # what is quoted may hold commas
+            raise DataError(f"{path}: row {number} has {line.count(',') + 1} columns, but the first line "
+                            f"names {len(names)}; the file is truncated or damaged")
+    return _rows(path, lines, delimiter=",", quotechar='"', comments=None,
+                 usecols=[names.index(axis) for axis in "xyz"])
+
+
+def _lines(path: Path) -> list[str]:
     try:
-        text = path.read_text(encoding="utf-8").replace(",", " ")
+        return path.read_text(encoding="utf-8-sig").splitlines()     # some programs begin with a mark
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: expected rows of numbers x y z ({one_line(error)})") from None
+
+
+def _rows(path: Path, lines: list[str], **layout: Any) -> np.ndarray:
+    """Points (N, 3) of lines of numbers with blanks between them, or in another layout (of np.loadtxt)."""
+    try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            array = np.loadtxt(text.splitlines(), ndmin=2)
+            array = np.loadtxt(lines, ndmin=2, **layout)
     except ValueError as error:
         raise DataError(f"{path}: expected rows of numbers x y z ({one_line(error)})") from None
     return _columns(path, array) if array.size else np.empty((0, 3))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _is_cloud(array: np.ndarray) -> bool:
@@ -258,5 +316,5 @@ def _columns(path: Path, array: np.ndarray) -> np.ndarray:
 
 
 _READERS = {".bin": _read_bin, ".pcd": pcd.read, ".ply": ply.read, ".xyz": _read_text, ".txt": _read_text,
-            ".npy": _read_npy, ".npz": _read_npz}
+            ".csv": _read_csv, ".npy": _read_npy, ".npz": _read_npz}
 FOLDER_SUFFIXES = tuple(suffix for suffix in _READERS if suffix != ".txt")
