@@ -7,7 +7,7 @@ import numpy as np
 from lidarflow import robust
 from lidarflow.config import GroundConfig
 from lidarflow.kernels import ground_level
-from lidarflow.rows import median
+from lidarflow.rows import every_few, median
 from lidarflow.silence import silenced
 
 _PATCHWORK_HEIGHT_M = 1.723   # the height Patchwork++ is tuned for; clouds are shifted to it
@@ -105,7 +105,7 @@ def _led_to(points: np.ndarray, max_height_m: float) -> np.ndarray:
     near = np.flatnonzero(range_sq < _PLANE_RADIUS_M**2)
     if len(near) < _MIN_CLOUD_POINTS:
         return np.ones(len(points), bool)
-    by_x, by_y, level_m = _plane(points[near[::max(len(near) // _PLANE_POINTS, 1)]])
+    by_x, by_y, level_m = _plane(points[near[every_few(len(near), _PLANE_POINTS)]])
     return z - (by_x * x + by_y * y + level_m) <= max_height_m + range_sq / (2.0 * _BEND_RADIUS_M)
 
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from lidarflow.rows import every_few
+
 _SAMPLE = 3000             # points, and normals; they tell shares to 0.01
 _NEAREST_M, _FARTHEST_M = 1.0, 30.0
 _FLAT = 2.9                # times wider across than along: 3.3 or more of streets, 2.5 of a narrow corridor
@@ -25,8 +27,8 @@ def doubt(points: np.ndarray, normals: np.ndarray) -> str:
     Most scans are flat: along z, if that is up. And much of them is ground, whose normals are about z. Clouds
     that are upside down are not noticed: they are as those of a sensor below a ceiling.
     """
-    axis = _flat_axis(_some(points))
-    if axis in ("x", "y"):
+    axis = _wrong_flat_axis(_some(points))
+    if axis:
         return f"the cloud is flat along {axis}; {_ADVICE}"
     lean_deg = _lean_deg(_some(normals))
     return f"the ground leans by {lean_deg:.0f} degrees; {_ADVICE}" if lean_deg else ""
@@ -34,12 +36,12 @@ def doubt(points: np.ndarray, normals: np.ndarray) -> str:
 
 def _some(rows: np.ndarray) -> np.ndarray:
     """Some of the rows (N, 3), evenly over their order, but those that are NaN."""
-    some = rows[::max(1, len(rows) // _SAMPLE)]
+    some = rows[every_few(len(rows), _SAMPLE)]
     return some[np.isfinite(some[:, 0])]
 
 
-def _flat_axis(points: np.ndarray) -> str:
-    """The axis nearest to the direction along which points (N, 3) are flat; "" where there is none.
+def _wrong_flat_axis(points: np.ndarray) -> str:
+    """The axis, "x" or "y", nearest to which points (N, 3) are flat; "" where that is z, or there is none.
 
     Seen from the sensor: a wall before it is flat along its normal, but far off along that as well.
     """
@@ -50,7 +52,7 @@ def _flat_axis(points: np.ndarray) -> str:
     if squares[1] <= max(_FLAT**2 * squares[0], _LINE * squares[2]):
         return ""
     x, y, z = np.abs(directions[:, 0])
-    return "z" if z > _ANOTHER_AXIS else "x" if x > y else "y"
+    return "" if z > _ANOTHER_AXIS else "x" if x > y else "y"
 
 
 def _lean_deg(normals: np.ndarray) -> float:
@@ -63,7 +65,7 @@ def _lean_deg(normals: np.ndarray) -> float:
     least = max(1.0, _LEAST_SHARE * len(normals), _CLEARLY_MORE * np.count_nonzero(rising[:, 2] > _ALIKE))
     if len(rising) < least:
         return 0.0
-    candidates = rising[::max(1, len(rising) // _CANDIDATES)]
+    candidates = rising[every_few(len(rising), _CANDIDATES)]
     best = candidates[np.count_nonzero(rising @ candidates.T > _ALIKE, axis=0).argmax()]
     mean = rising[rising @ best > _ALIKE].mean(axis=0)
     mean /= np.linalg.norm(mean)
