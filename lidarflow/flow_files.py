@@ -8,6 +8,7 @@ import numpy as np
 
 from lidarflow import io, pose
 from lidarflow.config import Config
+from lidarflow.datasets.clouds import one_line
 from lidarflow.errors import DataError
 from lidarflow.settings import to_dict
 from lidarflow.types import FlowResult, SolveStats
@@ -97,7 +98,7 @@ def load_flow(path: Path) -> FlowFile:
         config, stats = json.loads(str(arrays["config"])), json.loads(str(arrays["stats"]))
         motions = _motions_of_rows(arrays["motion"])
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: damaged flow file ({io.one_line(error)})") from None
+        raise DataError(f"{path}: damaged flow file ({one_line(error)})") from None
     ego_motion = arrays["ego_motion"].astype(np.float64)
     if not pose.is_rigid(ego_motion, 1e-4) or not isinstance(config, dict) or not isinstance(stats, dict):
         raise DataError(f"{path}: damaged flow file; its ego_motion, config or stats make no sense")

@@ -20,6 +20,7 @@ import tomli_w
 from lidarflow import pose
 from lidarflow.config import Config
 from lidarflow.datasets import arrays
+from lidarflow.datasets.clouds import one_line
 from lidarflow.errors import DataError
 from lidarflow.rgbd_config import RgbdConfig
 from lidarflow.settings import to_dict
@@ -184,8 +185,3 @@ def write_text(path: Path, text: str) -> None:
 
 def _joined(row: list[float]) -> str:
     return " ".join(f"{value:.12g}" for value in row)
-
-
-def one_line(error: BaseException) -> str:
-    """The first line of what an error says, or its name."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
