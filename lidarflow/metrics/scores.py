@@ -64,7 +64,6 @@ def score(points: np.ndarray, result: FlowResult, truth: Truth) -> Scores:
     graph = result.in_graph & result.valid
     # Poses alone do not know what moves: all that is called moving would count as wrong.
     knows_movers = truth.origin != POSES_ONLY
-    called_moving = result.is_dynamic & knows_movers
     error = np.full(len(known), np.nan)
     error[known] = end_point_error(result.flow[known], truth.flow[known])
     residual = truth.residual_flow(points)
@@ -82,7 +81,7 @@ def score(points: np.ndarray, result: FlowResult, truth: Truth) -> Scores:
         accuracy_static=accuracy(result.flow[still], truth.flow[still]),
         accuracy_dynamic=accuracy(result.flow[moving], truth.flow[moving]),
         three_way=three_way(error[counted], truth.is_dynamic[counted], truth.is_foreground[counted],
-                            called_moving[counted]),
+                            result.is_dynamic[counted] & knows_movers),
         buckets=None if truth.category is None else buckets(
             points[above], error[above], residual[above], truth.category[above]),
         by_range=by_range(points[known], error[known], truth.is_dynamic[known]),
@@ -91,7 +90,7 @@ def score(points: np.ndarray, result: FlowResult, truth: Truth) -> Scores:
         t_e=t_e,
         r_e_rad=r_e,
         movers_found=mean_of(result.is_dynamic[moving]),
-        false_movers=mean_of(called_moving[still]) if knows_movers else float("nan"),
+        false_movers=mean_of(result.is_dynamic[still & knows_movers]),
         ego_error_m=float(pose.translation_distance(*ego)[0]),
         ego_error_rad=float(pose.rotation_distance(*ego)[0]),
     )
