@@ -268,6 +268,7 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
     timed = Stopwatch(dict(prepared.seconds))
     points = pair.source.points
     by_world = beside.begin(_by_world, points, ego_motion)
+    doubt = beside.begin(upright.doubt, points, source.thinned.planes.normals)
     with timed("objects"):
         found = Attribution.none(len(points))
         if prepared.search:
@@ -301,10 +302,9 @@ def explain(prepared: Prepared, config: Config, beside: Aside) -> tuple[FlowResu
         valid = source.ground | found.explained | is_solved
         object_id = np.append(found.ids, np.int32(-1)).take(found.owner)
         std_m[~valid] = np.nan
-        doubt = upright.doubt(points, source.thinned.planes.normals)
     result = FlowResult(
         flow, dense, valid, in_graph, is_dynamic, ego_motion, stats, timed.seconds, *matches, source.ground,
-        object_id, found.objects, std_m, doubt)
+        object_id, found.objects, std_m, doubt.result())
     return result, found.tracks
 
 
