@@ -230,5 +230,3 @@ def given(config: Any, kind: type[Settings]) -> Settings:
         found = file = repr(str(config))
     how = f"lidarflow.load({file})" if kind is Config else f"lidarflow.load({file}, (), {kind.__name__})"
     raise ConfigError(f"settings: {found}; expected a {kind.__name__}, such as {how}")
-
-

@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -93,8 +94,6 @@ def notes_of(stop: BaseException | None) -> list[str]:
 
 def announce_first_use() -> None:
     """A line on standard error where kernels have not been compiled on this machine yet."""
-    from functools import partial
-
     from lidarflow import first_use
 
     first_use.announce(partial(console(sys.stderr).print, soft_wrap=True))

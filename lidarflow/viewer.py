@@ -201,5 +201,3 @@ def _log_arrows(stream: rr.RecordingStream, entity: str, origins: np.ndarray, ve
                 size_px: float) -> None:
     stream.log(entity, rr.Arrows3D(origins=origins.astype(np.float32), vectors=vectors.astype(np.float32),
                                    colors=colours, radii=rr.Radius.ui_points(size_px)))
-
-

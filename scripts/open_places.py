@@ -40,8 +40,9 @@ def main() -> None:
         for speed in SPEEDS_M_PER_S:
             off_m = np.concatenate(
                 [errors_m(sensor, speed, seed, wanted.pairs) for seed in range(wanted.seeds)])
-            alone, along = (off_m > OFF_M).sum(axis=0)
-            print(f"| {name} | {speed:g} | {len(off_m)} | {alone} | {along} | {np.median(off_m[:, 1]):.3f} |")
+            alone, in_sequence = (off_m > OFF_M).sum(axis=0)
+            print(f"| {name} | {speed:g} | {len(off_m)} | {alone} | {in_sequence} "
+                  f"| {np.median(off_m[:, 1]):.3f} |")
 
 
 if __name__ == "__main__":
